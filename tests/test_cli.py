@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import json
 import logging
 import os
@@ -20,6 +21,7 @@ from humangs_jax.cli import fit, interrupts, screen
 from humangs_jax.cli.interrupts import PATIENCE
 from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import stage
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.io.images import read_image, write_png
@@ -308,9 +310,9 @@ class Sample:
             screen.warn("odd")
         with stage("writing"):
             if self.fails:
-                raise {"usage": UsageError, "data": ValueError, "option": OSError, "keys": KeyboardInterrupt}[
-                    self.fails
-                ]("--port 9: taken" if self.fails == "option" else "no good")
+                raise {"usage": UsageError, "data": ValueError, "keys": KeyboardInterrupt}.get(
+                    self.fails, functools.partial(ArgumentError, "frame_ms")
+                )("no good")
         screen.tell("the report")
         screen.wrote(Path("my file.npz"), "3 numbers")
         screen.suggest("humangs view", Path("my file.npz"))
@@ -363,10 +365,12 @@ def test_quiet_and_verbose(sample, capsys):
 
 @pytest.mark.parametrize(("fails", "code"), [("usage", 2), ("data", 1), ("option", 2), ("keys", 130)])
 def test_exit_codes(sample, capsys, fails, code):
+    """An argument of the library that is wrong is an option here."""
     assert cli.execute(["sample", "--fails", fails]) == code
     out, err = capsys.readouterr()
     last = err.splitlines()[-1]
-    assert out == "" and last.startswith("humangs: interrupted" if fails == "keys" else "humangs: error: ")
+    begins = {"keys": "humangs: interrupted", "option": "humangs: error: --frame-ms no good"}
+    assert out == "" and last.startswith(begins.get(fails, "humangs: error: no good"))
 
 
 def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypatch, capsys):

@@ -18,6 +18,7 @@ import numpy as np
 
 from humangs_jax.apps.start import photo_files
 from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -263,14 +264,14 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
         raise ValueError(f"no person in {_few([photo.name for photo in photos])}: expected one who is seen as a whole")
     if person is not None:
         if not 0 <= person < count:
-            raise ValueError(f"--person {person}: expected 0 to {count - 1}, as on {sheet}")
+            raise ArgumentError("person", f"{person}: expected 0 to {count - 1}, as on {sheet}")
     else:
         areas = _areas(photos)
         rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
         if rivals:
             where = _few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
             raise ValueError(
-                f"{len(rivals) + 1} people in {where}: expected one. --person 0 to {len(rivals)}: numbers on {sheet}"
+                f"{len(rivals) + 1} people in {where}: expected one. Person 0 to {len(rivals)}: numbers on {sheet}"
             )
     if unclear := [photo.name for photo in photos if photo.unclear]:
         raise ValueError(

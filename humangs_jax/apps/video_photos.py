@@ -60,7 +60,7 @@ def photos_of_video(video: Path, folder: Path) -> VideoPhotos:
     if folder.exists() or folder.is_symlink():
         known = read_json(folder / MARK) if (folder / MARK).is_file() else None
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
-            problem = f"exists, and is not of {video.name} as it is now: expected another --out, or remove it"
+            problem = f"exists, and is not of {video.name} as it is now: expected another folder, or remove it"
             raise CaptureError(folder, "", problem)
         return VideoPhotos(video, folder, tuple(known["chosen"]), known["frames"])
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))

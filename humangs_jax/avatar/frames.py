@@ -15,6 +15,7 @@ from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -214,11 +215,11 @@ def excerpt(
     length = count / motion.fps
     stop = length if stop is None else stop
     if not 0 <= start < stop <= length + 0.5 / motion.fps:
-        raise ValueError(
-            f"start {start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds"
+        raise ArgumentError(
+            "start", f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds"
         )
     if loop < 1:
-        raise ValueError(f"loop {loop}: expected at least 1")
+        raise ArgumentError("loop", f"{loop}: expected at least 1")
     rate = motion.fps if fps is None else fps
     check_limit("frames", loop * (stop - start) * rate, f"frames in {loop * (stop - start):g} seconds")
     first = min(int(start * motion.fps), count - 1)

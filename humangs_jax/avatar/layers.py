@@ -27,6 +27,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
@@ -56,7 +57,7 @@ class ExrLayers:
     def check(self) -> None:
         """Raises: ValueError naming a layer that does not exist."""
         if unknown := [layer for layer in self.layers if layer not in LAYERS]:
-            raise ValueError(f"channels {unknown[0]!r}: expected some of {', '.join(LAYERS)}")
+            raise ArgumentError("channels", f"{unknown[0]!r}: expected some of {', '.join(LAYERS)}")
 
     def bytes_of(self, views: int, width: int, height: int) -> int:
         """Size of all layers in memory, in 32 bits."""

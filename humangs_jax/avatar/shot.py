@@ -8,6 +8,8 @@ import dataclasses
 import math
 from typing import Literal
 
+from humangs_jax.core.configuration import ArgumentError
+
 LARGEST_SIDE = 8192
 """Pixels: the largest level of H.264 and VP9."""
 
@@ -44,12 +46,12 @@ class Shot:
         for name in ("size", "width", "height"):
             value = getattr(self, name)
             if value is not None and not 1 <= value <= LARGEST_SIDE:
-                raise ValueError(f"{name} {value}: expected 1 to {LARGEST_SIDE} pixels")
+                raise ArgumentError(name, f"{value}: expected 1 to {LARGEST_SIDE} pixels")
         ranges = {"azimuth": (-36000, 36000), "elevation": (-89, 89), "fov": (1, 150), "distance": (0.01, 1000)}
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise ValueError(f"{name} {value}: expected a number from {low} to {high}")
+                raise ArgumentError(name, f"{value}: expected a number from {low} to {high}")
         self.color()
 
     @property
@@ -75,4 +77,4 @@ class Shot:
         try:
             return named_color(self.background)
         except ValueError as error:
-            raise ValueError(f"{error}, or transparent") from None
+            raise ArgumentError("background", f"{str(error).removeprefix('background ')}, or transparent") from None

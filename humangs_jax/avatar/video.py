@@ -13,6 +13,7 @@ import numpy as np
 
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import to_uint8, write_png
 
@@ -29,30 +30,30 @@ PALETTE_FRAMES = 16
 """The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
-def check_video(
-    path: str | Path, frames: int, width: int, height: int, transparent: bool = False, option: str = "--out"
-) -> None:
+def check_video(path: str | Path, frames: int, width: int, height: int, transparent: bool = False) -> None:
     """Check that such a video can be written; call it before its frames are drawn.
 
-    Raises: ValueError naming the option for a suffix that is no video (none is a folder of PNG files), transparency that the
-    format does not have, or a GIF that would not fit into memory; OSError if there is something else of that name.
+    Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency that the
+    format does not have, or a GIF that would not fit into memory, or something else of that name.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (*SUFFIXES, ""):
-        raise ValueError(f"{option} {path}: expected a name ending in {', '.join(SUFFIXES)}, or a folder for PNG files")
+        raise ArgumentError(
+            "path", f"{path}: expected a name ending in {', '.join(SUFFIXES)}, or a folder for PNG files"
+        )
     if transparent and suffix in (".mp4", ".gif"):
-        raise ValueError(
-            f"{option} {path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a color"
+        raise ArgumentError(
+            "path", f"{path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a color"
         )
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
-        raise ValueError(
-            f"{option} {path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm"
+        raise ArgumentError(
+            "path", f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm"
         )
     if suffix and path.is_dir():
-        raise IsADirectoryError(f"{option} {path}: is a folder: expected a file name")
+        raise ArgumentError("path", f"{path}: is a folder: expected a file name")
     if not suffix and path.is_file():
-        raise NotADirectoryError(f"{option} {path}: is a file: expected a folder name")
+        raise ArgumentError("path", f"{path}: is a file: expected a folder name")
 
 
 @checked_arguments
@@ -72,13 +73,13 @@ def write_video(
     path = Path(path)
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"{path}: expected a positive number of frames per second, got {fps}")
-    check_video(path, 0, 0, 0, option="video")
+    check_video(path, 0, 0, 0)
     checked = _checked(path, frames)
     first = next(checked, None)
     if first is None:
         raise ValueError(f"{path}: expected at least one frame, got none")
     height, width, channels = first.shape
-    check_video(path, 0, width, height, channels == 4, option="video")
+    check_video(path, 0, width, height, channels == 4)
     count = itertools.count()  # of the frames that have been taken
     frames = (frame for frame, _ in zip(itertools.chain([first], checked), count, strict=False))
     writers = {".mp4": _write_mp4, ".webm": _write_webm, ".gif": _write_gif}

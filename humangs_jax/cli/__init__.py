@@ -138,14 +138,17 @@ def _command(name: str) -> Callable[..., Any]:
 
 
 def _failed(error: Exception, verbose: bool) -> int:
-    """One line. What begins with an option is bad usage, wherever it was raised."""
+    """One line. An argument of the library is an option here."""
     from humangs_jax.cli import screen
-    from humangs_jax.cli.options import UsageError
+    from humangs_jax.cli.options import UsageError, option_of
+    from humangs_jax.core.configuration import ArgumentError
 
     if isinstance(error, UnicodeEncodeError):  # of a library that takes names in UTF-8 only
         error = ValueError(f"{error.object[:200]}: expected a name in UTF-8")
+    if isinstance(error, ArgumentError):
+        error = UsageError(f"{option_of(error.argument)} {error.problem}").with_traceback(error.__traceback__)
     screen.fail(error, verbose)
-    return BAD_USAGE if isinstance(error, UsageError) or str(error).startswith("--") else BAD_DATA
+    return BAD_USAGE if isinstance(error, UsageError) else BAD_DATA
 
 
 def _interrupted() -> int:

@@ -1,6 +1,5 @@
 """`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
 
-import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -61,8 +60,7 @@ class Animate:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
-        with _options():
-            self.shot.check()
+        self.shot.check()
         require_between(-math.inf, math.inf, turn=self.turn)
         require_between(SLOWEST, FASTEST, fps=self.fps)
         _require_place(self.out)
@@ -71,13 +69,14 @@ class Animate:
             from humangs_jax.avatar.frames import excerpt, images, motion_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.motion import load_motion
+            from humangs_jax.io.reading import reading
 
             check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
-            with _options(self.motion):
+            with reading(self.motion or "the motion", "motion"):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
             poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
@@ -119,8 +118,7 @@ class Render:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
-        with _options():
-            self.shot.check()
+        self.shot.check()
         require_between(SLOWEST, FASTEST, fps=self.fps)
         video, views = self.out.suffix != "", self.views
         if views is None:
@@ -141,8 +139,7 @@ class Render:
 
             check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
             layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
-            with _options():
-                layers.check()
+            layers.check()
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
@@ -218,19 +215,6 @@ class View:
             name = None if self.motion is None else self.motion.stem
             text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
-
-
-@contextlib.contextmanager
-def _options(file=None):
-    """Errors of the library that begin with the name of an option are errors of the command line. file: whose limits are hit."""
-    from humangs_jax.io.reading import Refused
-
-    try:
-        yield
-    except Refused as error:
-        raise ValueError(f"{'the motion' if file is None else file}: {error}") from error
-    except ValueError as error:
-        raise UsageError(f"--{error}") from error
 
 
 def _require_place(out):

@@ -115,7 +115,7 @@ class Reconstruct:
             settings = chosen_settings(self.preset, self.config)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
         if self.refine not in (None, "0") and photos.masks is None:
-            raise ValueError(f"--refine {self.refine}: needs masks, and {self.capture} has none")
+            raise UsageError(f"--refine {self.refine}: needs masks, and {self.capture} has none")
         views = settings.views if settings is not None and self.views is None else self.views
         if views == "auto" or (views is not None and views < photos.view_count):
             with stage("choosing photos"):
@@ -294,11 +294,11 @@ class Export:
         """What does not go together is said before anything is read. Raises: ValueError."""
         for option, value in (("--frame", self.frame), ("--frames", self.frames)):
             if value is not None and (self.motion is None or out is None):
-                raise ValueError(f"{option} {value}: expected --motion and --out with it")
+                raise UsageError(f"{option} {value}: expected --motion and --out with it")
         form = self._format(out)
         if self.frame is not None and (self.frames is not None or (form is not None and form.animated)):
             with_it = "--frames" if self.frames is not None else "a file that holds the whole motion: use --frames"
-            raise ValueError(f"--frame {self.frame}: does not go with {with_it}")
+            raise UsageError(f"--frame {self.frame}: does not go with {with_it}")
         if self.rest and form is not None and not form.rest_fields:
             raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
 
@@ -334,7 +334,7 @@ class Export:
         else:
             frame = self.frame or 0
             if not 0 <= frame < count:
-                raise ValueError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
+                raise UsageError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
             numbers = range(frame, frame + 1)
         chosen = slice(numbers.start, numbers.stop, numbers.step)
         fps = motion.fps / numbers.step

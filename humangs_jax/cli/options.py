@@ -31,6 +31,11 @@ class UsageError(ValueError):
     """A command line that cannot be meant; the exit code is 2. The message names the option."""
 
 
+def option_of(argument: str) -> str:
+    """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are written to --out."""
+    return "--out" if argument == "path" else f"--{argument.replace('_', '-')}"
+
+
 def require_parent(path: Path, option: str = "--out", inputs: Iterable[Path | None] = ()) -> None:
     """A file can be written to that path. inputs: files that the command reads (None is left out). Raises: UsageError."""
     if path.is_dir():
@@ -114,7 +119,7 @@ def require_between(least: float | int, most: float | int, **values: float | int
         if value is not None and not (least <= value <= most and math.isfinite(value)):
             bounds = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
             bounds = "a finite number" if least == -math.inf else bounds
-            raise UsageError(f"--{name.replace('_', '-')} {value}: expected {bounds}")
+            raise UsageError(f"{option_of(name)} {value}: expected {bounds}")
 
 
 ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}

@@ -70,7 +70,7 @@ class Preprocess:
         if not 0 < factors[0] <= factors[1]:
             raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
         if not self.body.is_file():
-            raise FileNotFoundError(f"--body {self.body}: no such file")
+            raise UsageError(f"--body {self.body}: no such file")
         require_at_least(1, workers=self.workers)
         require_folder(self.out)
         with stage("starting"):

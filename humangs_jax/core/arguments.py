@@ -10,7 +10,7 @@ import functools
 import inspect
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 from humangs_jax.core.pytree import shape_fault
@@ -19,7 +19,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
 """Not checked: those of numpy and JAX do as well."""
-SEQUENCES = {list: Sequence, Sequence: Sequence}
+SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable}
 """What lists of something may be; what is in them is not checked."""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
@@ -41,12 +41,13 @@ HINTS = {
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit each other.
 
-    Parameters whose annotation is not made of plain classes and sequences (arrays, numbers, callables) are left alone.
+    Parameters that may be something else than plain classes, sequences or arrays (numbers, callables) are left alone.
     Raises: TypeError, one line, for another class or a name that the function does not have; ValueError for shapes, and for
     a batch of what functions take one of (`one_at_a_time`).
     """
     signature = inspect.signature(function)
     expected = {name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))}
+    arrays = {name: found for name, p in signature.parameters.items() if (found := _arrays(p.annotation))}
     call = _call(function, signature)
 
     @functools.wraps(function)
@@ -68,9 +69,33 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
                 )
             if fault := shape_fault(value):
                 raise ValueError(f"{call}: {name}{fault}")
+        for name in arrays.keys() & given.keys():
+            if fault := _no_array(arrays[name], given[name]):
+                raise (ValueError if hasattr(given[name], "shape") else TypeError)(f"{call}: {name}: {fault}")
         return function(*args, **kwargs)
 
     return checked
+
+
+def _arrays(annotation: Any) -> tuple[Any, ...]:
+    """The types of arrays that an annotation stands for, with None where it may be that; none if it may be something else."""
+    options = typing.get_args(annotation) or (annotation,)
+    known = all(hasattr(x, "dims") or x is type(None) for x in options)
+    return options if known and any(hasattr(x, "dims") for x in options) else ()
+
+
+def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
+    """What is wrong with a value that should be an array; numbers are arrays without axes."""
+    if value is None and type(None) in options:
+        return None
+    types_ = [x for x in options if hasattr(x, "dims")]
+    shape = getattr(value, "shape", () if isinstance(value, NUMBERS) else None)
+    ranks = {len(x.dims) for x in types_ if isinstance(x.dims, tuple) and x.index_variadic is None}
+    if shape is not None and (len(ranks) < len(types_) or len(shape) in ranks):
+        return None
+    axes = " or ".join(f"({', '.join(str(x.dim_str).split())})" for x in types_)
+    given = f"{type(value).__name__}; jnp.asarray makes one" if shape is None else str(shape)
+    return f"expected an array of shape {axes}, got {given}"
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
@@ -80,7 +105,8 @@ def _classes(annotation: Any) -> tuple[type, ...]:
     options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
     plain = [isinstance(x, type) and not typing.get_args(x) and not hasattr(x, "dims") for x in options]
     known = [x not in (*NUMBERS, inspect.Parameter.empty, object, Any) for x in options]
-    return options if all(plain) and all(known) and not any(getattr(x, "_is_protocol", False) for x in options) else ()
+    protocol = [getattr(x, "_is_protocol", False) and not getattr(x, "_is_runtime_protocol", False) for x in options]
+    return options if all(plain) and all(known) and not any(protocol) else ()
 
 
 def _call(function, signature):

@@ -88,6 +88,14 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
     return dataclasses.field(default=default, metadata={"cost": cost, "gain": gain, "measured": measured})
 
 
+class ArgumentError(ValueError):
+    """An argument of a function that cannot be meant; the command line shows its name as that of an option."""
+
+    def __init__(self, argument: str, problem: str) -> None:
+        super().__init__(f"{argument} {problem}")
+        self.argument, self.problem = argument, problem
+
+
 class UnknownPresetError(KeyError):
     """A `KeyError` whose text is a line, not its repr."""
 

@@ -109,6 +109,8 @@ def find_people(
         names = tuple(f"{index:04d}" for index in range(len(source)))
         return People(names, lambda index: _from_source(source, index, names[index], inputs, _model(body)))
     cases = list(source)
+    if others := [type(case).__name__ for case in cases if not isinstance(case, Case)]:
+        raise TypeError(f"evaluate: source: expected Cases, got a {others[0]} among them")
     return People(tuple(case.name for case in cases), cases.__getitem__)
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError, numbers
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -124,7 +125,7 @@ def check_place(
     if target.resolve() != source.resolve():
         check_replaceable(target, overwrite, "capture.json", (source, *inputs, *_photo_files(source, description)))
     elif (body := target / description["body"]).exists() and not overwrite:
-        raise ValueError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
+        raise ArgumentError("overwrite", f"is needed: {body} exists; or another folder for the fit")
     check_writable(target)
     return target
 
@@ -183,9 +184,7 @@ def _with_cameras(description, capture):
 def _copy(source, folder, file):
     target = folder / file
     if not target.resolve().is_relative_to(folder.resolve()):
-        raise CaptureError(
-            source / "capture.json", file, "lies outside of the capture folder: fit it in place, without --out"
-        )
+        raise CaptureError(source / "capture.json", file, "lies outside of the capture folder: fit it in place")
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source / file, target)
 

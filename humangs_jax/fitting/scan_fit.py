@@ -17,6 +17,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_body, without_expression
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.fitting.report import Change, FitReport, Stage, limit_violations
 from humangs_jax.fitting.residuals.scan import Given, ScanMatches, Target, Tolerances, body_surface, scan_problem
 from humangs_jax.fitting.scan_reading import SCAN_LANDMARKS, Scan, checked_joints, read_scan
@@ -93,7 +94,7 @@ def fit_scan(
         scan = read_scan(scan, config.samples)
     points, known = checked_joints(joints or {})
     if height is not None and not 0.5 < height < 2.6:
-        raise ValueError(f"--height {height}: expected metres, 0.5 to 2.6")
+        raise ArgumentError("height", f"{height}: expected metres, 0.5 to 2.6")
     surface = body_surface(without_expression(body), SCAN_LANDMARKS)
     known = known * np.asarray(surface.landmarks.known)
     whole = scan_problem(surface, surface.landmarks.joint_names, config.shapes)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import floats
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import load_photos, write_description
@@ -98,7 +99,7 @@ def _into_world(vertices, up):
     """The similarity that stands a scan upright around the origin."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if up is not None and up not in AXES:
-        raise ValueError(f"--up {up}: expected one of {', '.join(AXES)}")
+        raise ArgumentError("up", f"{up}: expected one of {', '.join(AXES)}")
     sign, axis = AXES[up] if up else (1, int((high - low).argmax()))
     above = sign * np.eye(3)[axis]
     forward = np.eye(3)[2 if axis == 1 else (0 if axis == 2 else 1)]

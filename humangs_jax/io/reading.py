@@ -21,6 +21,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.printable import printable
 
 logger = logging.getLogger(__name__)
@@ -175,7 +176,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
     """
     try:
         yield
-    except raises:
+    except (raises, ArgumentError):
         raise
     except FileError as error:  # names its file already
         raise raises("", "", error) from error

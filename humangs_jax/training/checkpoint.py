@@ -258,7 +258,7 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE) - longer):
             if earlier.get(name) != now.get(name):
                 raise ValueError(
-                    f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another --out"
+                    f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another folder"
                 )
     if write:
         write_text(path, config_to_json(config, indent=1))

@@ -247,7 +247,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
             raise
         raise ValueError(
             f"{error}: expected architecture, conventions and runtime. A run of a version before `model` was divided so "
-            "cannot be continued: start another with --init-weights (its weights.safetensors still loads) and another --out"
+            "cannot be continued: start another one from its weights.safetensors in another folder"
         ) from error
 
 

@@ -140,7 +140,7 @@ def training_people(
     if on_the_fly:
         parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
     if not parts:
-        raise ValueError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
+        raise ValueError("nobody to train on: expected a folder of captures, or a number of people on the fly")
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
 
 

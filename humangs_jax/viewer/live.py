@@ -18,6 +18,7 @@ from pathlib import Path
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import say
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import Motion
@@ -87,7 +88,7 @@ def follow(
     elif path.suffix != ".npz" or not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: no such run: expected the folder of a training run, or an avatar file (.npz)")
     elif capture is not None:
-        raise ValueError(f"--capture {capture}: only for the folder of a training run; {path} is an avatar file")
+        raise ArgumentError("capture", f"{capture}: only for the folder of a training run; {path} is an avatar file")
     with LiveView(motion, port) as view, contextlib.suppress(KeyboardInterrupt):
         say(f"{view.url} shows {path} as it changes; Ctrl-C ends.")
         if open_browser:

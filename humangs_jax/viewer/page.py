@@ -23,7 +23,7 @@ from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
 from humangs_jax.core.arguments import checked_arguments
-from humangs_jax.core.configuration import config_from_json
+from humangs_jax.core.configuration import ArgumentError, config_from_json
 from humangs_jax.core.printable import printable
 from humangs_jax.core.progress import say
 from humangs_jax.data.motion import Motion, grounded, load_motion
@@ -145,7 +145,7 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Page)
     except (OSError, OverflowError) as error:
-        raise OSError(f"--port {port}: {error}") from error
+        raise ArgumentError("port", f"{port}: {error}") from error
     server.daemon_threads = True
     return server
 

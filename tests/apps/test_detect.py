@@ -47,9 +47,9 @@ def test_without_cameras_the_largest_of_each_photo_is_the_person():
 
 def test_who_is_meant_is_never_guessed():
     photos = same_people([photo("a", found(1, 90.0), found(2, 60.0)), photo("b", found(3, 80.0))])
-    with pytest.raises(ValueError, match=r"2 people in a: expected one\. --person 0 to 1: numbers on s\.png"):
+    with pytest.raises(ValueError, match=r"2 people in a: expected one\. Person 0 to 1: numbers on s\.png"):
         choose(photos, None, Path("s.png"))
-    with pytest.raises(ValueError, match=r"--person 2: expected 0 to 1, as on s\.png"):
+    with pytest.raises(ValueError, match=r"^person 2: expected 0 to 1, as on s\.png"):
         choose(photos, 2, Path("s.png"))
     with pytest.raises(ValueError, match="no person in a, b: expected one"):
         choose([photo("a"), photo("b")], 0, Path("s.png"))

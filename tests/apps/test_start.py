@@ -203,7 +203,7 @@ def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, mon
     assert cli.execute(cameras) == 0 and load_photos("me").masks is None
     assert (
         cli.execute(["fit", "me"]) == cli.BAD_DATA
-        and "--person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
+        and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
     )
     assert cli.execute(["fit", "me", "--person", "1"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
@@ -232,7 +232,7 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected,
         shutil.rmtree(mine / name)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert (
-        "2 people in 0_00.png, 0_01.png, 0_02.png, ... (4 photos): expected one. --person 0 to 1: numbers on me/people.png"
+        "2 people in 0_00.png, 0_01.png, 0_02.png, ... (4 photos): expected one. Person 0 to 1: numbers on me/people.png"
         in (capsys.readouterr().err)
     )
     assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None

@@ -1,6 +1,8 @@
 """Wrong arguments of public functions: one line that says what came and what is expected."""
 
+import ast
 import dataclasses
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +13,8 @@ import pytest
 
 import humangs_jax as hg
 from humangs_jax.avatar.export.gaussians import write_ply
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace
@@ -131,6 +135,19 @@ WRONG = {
         lambda: stack_cameras(CAMERA),
         r"stack_cameras\(cameras\): cameras: expected Sequence, got Camera; a list of cameras",
     ),
+    "a list of coefficients": (
+        lambda: shape_body(load_body(), [0.0]),
+        r"^shape_body\(body, betas\): betas: expected an array of shape \(s_used\), got list; jnp.asarray makes one",
+    ),
+    "a batch of coefficients": (
+        lambda: shape_body(load_body(), jnp.zeros((2, 3))),
+        r"betas: expected an array of shape \(s_used\), got \(2, 3\)",
+    ),
+    "a number for people": (
+        lambda: hg.evaluate(3),
+        r"^evaluate\(source, ...\): source: expected str or .* or Iterable, got int",
+    ),
+    "names for people": (lambda: hg.evaluate(iter([3])), "source: expected Cases, got a int among them"),
     "as_trained": (lambda: hg.SPLAT_PRESETS["as_trained"], "no preset 'as_trained': .*SPLAT_PRESETS.avatar.rendering"),
     "of training": (lambda: hg.PRESETS["tiny"], "no preset 'tiny': expected one of realtime, .*training.config"),
 }
@@ -213,3 +230,15 @@ def test_presets_are_dicts():
     assert presets == {"a": 1} and "b" not in presets and presets.get("b") is None
     with pytest.raises(KeyError, match="no preset 'b': expected one of a; ask"):
         presets["b"]
+
+
+def test_errors_of_the_library_name_no_options():
+    """They are the command line's, which shows the name of an argument as an option."""
+    package, named, options = Path(hg.__file__).parent, [], set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if path.parent.name == "cli" and isinstance(node, ast.AnnAssign):
+                options.add(ast.unparse(node.target).replace("_", "-"))
+            elif path.parent.name != "cli" and isinstance(node, ast.Raise):
+                named += [(path.name, option) for option in re.findall(r"--([a-z-]+)", ast.unparse(node))]
+    assert len(options) > 100 and not [(name, option) for name, option in named if option in options]

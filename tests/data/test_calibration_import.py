@@ -370,10 +370,10 @@ def test_photos_that_do_not_fit_are_named(rig, tmp_path):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        ({"scale": 0.0}, "--scale 0"),
-        ({"scale": float("nan")}, "--scale nan"),
-        ({"up": "z"}, r"--up z: expected one of \+x, -x"),
-        ({"pixel_centers": "corner"}, "--pixel-centers corner: expected integer or half"),
+        ({"scale": 0.0}, "scale 0"),
+        ({"scale": float("nan")}, "scale nan"),
+        ({"up": "z"}, r"^up z: expected one of \+x, -x"),
+        ({"pixel_centers": "corner"}, "^pixel_centers corner: expected integer or half"),
     ],
 )
 def test_wrong_options_are_named(rig, options, problem):

@@ -85,7 +85,7 @@ def test_points_half_an_image_outside_are_dropped_and_counted(tmp_path, index, v
 
 def test_several_people_are_refused(tmp_path):
     people = [entry(), entry(shift=50), entry("back"), entry(shift=90)]
-    with pytest.raises(CaptureError, match=r"k\.json: view front: 3 people: expected one\. --person I takes the I-th"):
+    with pytest.raises(CaptureError, match=r"k\.json: view front: 3 people: expected one\. Person I is the I-th"):
         read(tmp_path / "k.json", people)
 
 
@@ -131,9 +131,9 @@ def test_a_person_can_be_chosen(tmp_path):
     first, second = (read(tmp_path / "k.json", people, person=i) for i in (0, 1))
     assert first.points[:, 0, 0].tolist() == [100.5, 120.5] and first.missing == ()
     assert second.points[0, 0, 0] == 150.5 and second.missing == ("back",)
-    with pytest.raises(CaptureError, match="--person 2: no view has this many people: expected 0 to 1"):
+    with pytest.raises(CaptureError, match="person 2: no view has this many people: expected 0 to 1"):
         read(tmp_path / "k.json", people, person=2)
-    with pytest.raises(ValueError, match="--person -1: expected 0 for the first"):
+    with pytest.raises(ValueError, match=r"^person -1: expected 0 for the first"):
         read(tmp_path / "k.json", people, person=-1)
 
 

@@ -269,7 +269,7 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
 
 def test_people_of_our_detector_are_not_mixed_in_silence(tmp_path):
     people_file(tmp_path / "keypoints.json")
-    with pytest.raises(CaptureError, match=r"view front: 2 people: expected one\. --person I"):
+    with pytest.raises(CaptureError, match=r"view front: 2 people: expected one\. Person I"):
         read(tmp_path / "keypoints.json")
     people_file(tmp_path / "one.json", people=1)
     assert read(tmp_path / "one.json").missing == ()

@@ -195,7 +195,7 @@ FOLDERS = {
     "no person": (only(room=room()), None, r"no person in room\.png: expected one"),
     "black": (only(dark=np.zeros((64, 48, 3))), None, r"no person in dark\.png: expected one"),
     "tiny photos": (only(a=room(8, 8), b=room(1, 1)), None, r"no person in a\.png, b\.png: expected one"),
-    "two people": (beside((1.0, 0.9)), None, r"2 people in both0\.png, both1\.png: expected one\. --person 0 to 1"),
+    "two people": (beside((1.0, 0.9)), None, r"2 people in both0\.png, both1\.png: expected one\. Person 0 to 1"),
     "a photo cut short": (files(odd_jpg=jpeg()[:2000]), None, r"odd\.jpg"),
     "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),
     "text under a photo's name": (files(odd_jpg=b"<html>404</html>"), None, r"odd\.jpg"),

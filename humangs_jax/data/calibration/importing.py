@@ -14,6 +14,7 @@ from typing import get_args
 
 import numpy as np
 
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
     Calibration,
@@ -213,11 +214,11 @@ def _unused_masks(calibration, photos, masks):
 
 def _check_options(scale, up, pixel_centers):
     if not 0 < scale < float("inf"):
-        raise ValueError(f"--scale {scale:g}: expected metres per unit of the source, more than 0")
+        raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
     if up is not None and up not in ROTATION_TO_Y_UP:
-        raise ValueError(f"--up {up}: expected one of {', '.join(ROTATION_TO_Y_UP)}")
+        raise ArgumentError("up", f"{up}: expected one of {', '.join(ROTATION_TO_Y_UP)}")
     if pixel_centers is not None and pixel_centers not in get_args(PixelCenters):
-        raise ValueError(f"--pixel-centers {pixel_centers}: expected {' or '.join(get_args(PixelCenters))}")
+        raise ArgumentError("pixel_centers", f"{pixel_centers}: expected {' or '.join(get_args(PixelCenters))}")
 
 
 def _check_folders(source, images, masks, out, overwrite):

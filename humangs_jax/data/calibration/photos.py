@@ -66,7 +66,7 @@ def _named_masks(calibration, images):
             missing = camera
     if found and missing is not None:
         what = f"{missing.mask}: no such mask" if missing.mask else "missing"
-        problem = f"{what}, but other images have one: expected all or none, or --masks DIR"
+        problem = f"{what}, but other images have one: expected all or none, or a folder of masks"
         raise CaptureError(calibration.file, f"{missing.name}: {calibration.mask_key}", problem)
     return found
 

@@ -40,7 +40,7 @@ class FileBody:
         """Mean and components of its hand poses. Raises: CaptureError for the package's own body, which has none."""
         if self.file == DEFAULT_BODY:
             problem = (
-                "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model (--body)"
+                "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model for body"
             )
             raise CaptureError("body", DEFAULT_BODY, problem)
         return load_hands(self.file)
@@ -110,7 +110,7 @@ def coefficients(
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
         problem = (
-            f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model (--body)"
+            f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
         )
         raise CaptureError(file, "betas", problem)
     of_expression = [i for i, name in enumerate(body.shape_names) if name.startswith("expression_")]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import DetectedImage, Detections, read_detections
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -61,7 +62,7 @@ def read_keypoints(
     """
     path = Path(path)
     if person is not None and person < 0:
-        raise ValueError(f"--person {person}: expected 0 for the first person, 1 for the second, ...")
+        raise ArgumentError("person", f"{person}: expected 0 for the first person, 1 for the second, ...")
     with reading(path, "keypoint file", CaptureError):
         return _read(path, names, width, height, person)
 
@@ -77,9 +78,7 @@ def _read(path, names, width, height, person):
     ]
     if person is not None and not any(people):
         most = max(len(image.people) for image in images if image is not None)
-        raise CaptureError(
-            path, f"--person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}"
-        )
+        raise CaptureError(path, f"person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}")
     keypoints = _assemble(people, detections.set, names)
     _check_pixels(path, keypoints)
     return dataclasses.replace(keypoints, shifted=_shifted(images, names))
@@ -175,7 +174,7 @@ def _chosen_person(
         raise CaptureError(
             image.file,
             field,
-            f"{clear} people: expected one. --person I takes the I-th of each view, counted from 0 in the order of the "
+            f"{clear} people: expected one. Person I is the I-th of each view, counted from 0 in the order of the "
             "file; or crop the photos, or delete the others from the file",
         )
     return _most_confident(people)
