@@ -25,10 +25,10 @@ from .body.library import load_body as load_body
 from .body.model import BodyModel as BodyModel
 from .body.model import BodyPose as BodyPose
 from .body.model import rest_pose as rest_pose
+from .core.compiling import compiler_options as compiler_options
 
 # JAX
-from .core.compile_cache import enable_compile_cache as enable_compile_cache
-from .core.compiler_options import compiler_options as compiler_options
+from .core.compiling import enable_compile_cache as enable_compile_cache
 
 # training and scores
 from .core.configuration import vary as vary

@@ -17,9 +17,9 @@ import pytest
 from command_line import run, save_tiny_avatar
 
 from humangs_jax import __version__, cli
-from humangs_jax.cli import fit, interrupts, screen
-from humangs_jax.cli.interrupts import PATIENCE
+from humangs_jax.cli import fit, screen
 from humangs_jax.cli.options import UsageError
+from humangs_jax.cli.screen import PATIENCE
 from humangs_jax.core import progress
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import stage
@@ -377,7 +377,7 @@ def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypat
     """Extensions that are interrupted while they are imported raise ImportError."""
 
     def run(self):
-        interrupts.heard.set()
+        screen.heard.set()
         raise ImportError("while initializing the extension")
 
     monkeypatch.setattr(Sample, "run", run)
@@ -459,9 +459,9 @@ def test_a_run_that_saves_for_longer_than_our_patience_is_not_ended(tmp_path):
     code = (
         "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from humangs_jax import cli\n"
-        "from humangs_jax.cli import interrupts\n"
+        "from humangs_jax.cli import screen\n"
         "from humangs_jax.training.loop import stop_requested\n"
-        "interrupts.PATIENCE = 0.2\n"
+        "screen.PATIENCE = 0.2\n"
         "class Training:\n"
         "    def run(self):\n"
         "        with stop_requested() as stopping:\n"

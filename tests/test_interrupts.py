@@ -99,7 +99,7 @@ def interrupted_after(seconds):
     """SIGINT so much later, unless the block has ended."""
     previous = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
-    note = sys.unraisablehook  # what a callback of the garbage collector drops comes again, as in `cli.interrupts`
+    note = sys.unraisablehook  # what a callback of the garbage collector drops comes again, as in `cli.screen`
     again = lambda what: (
         signal.setitimer(signal.ITIMER_REAL, 0.02) if what.exc_type is KeyboardInterrupt else note(what)
     )

@@ -56,7 +56,7 @@ def main() -> None:
         write_tables(arguments.out, arguments.page)
         return
     arguments.out.mkdir(parents=True, exist_ok=True)
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
     arguments.deadline = time.monotonic() + 60 * arguments.minutes
@@ -308,7 +308,7 @@ def batch_sizes(arguments: argparse.Namespace) -> Iterator[Measurement]:
 
         from experiments.common.interleaved import medians
         from experiments.training.cases import Case
-        from humangs_jax.core.compiler_options import compiler_options
+        from humangs_jax.core.compiling import compiler_options
 
         with tempfile.TemporaryDirectory() as folder:
             case = Case(preset, size, 4 if preset == "small" else 2, 3 if preset == "small" else 2, "float32", batch)

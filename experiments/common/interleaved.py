@@ -17,7 +17,7 @@ def prepare_process() -> None:
     """What has to be set before JAX starts: sleeping OpenMP threads, and an allocator that keeps what it has."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning ones would be counted as CPU time
 
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
 

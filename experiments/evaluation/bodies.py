@@ -83,8 +83,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject, score_tasks
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
-    from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
-    from humangs_jax.evaluation.cases import draw_views
+    from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
     seeds = seeds_asked_for(arguments, body)

@@ -51,7 +51,7 @@ def main() -> None:
     from experiments.common.results import publish
     from experiments.evaluation.real_people import draw_sheet
     from experiments.evaluation.real_rows import ROWS, Man, Results, avatar_of, section
-    from humangs_jax.core.compile_cache import enable_compile_cache
+    from humangs_jax.core.compiling import enable_compile_cache
 
     enable_compile_cache()
     results, man = (

@@ -17,8 +17,7 @@ from experiments.evaluation.results import TASKS, Scores
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.data.capture import Capture
-from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 from humangs_jax.evaluation.protocol import PROTOCOLS
 from humangs_jax.evaluation.scores import score_views
 from humangs_jax.evaluation.tables import mean_scores

@@ -38,7 +38,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.people < 1:
         parser.error(f"--people {arguments.people}: expected at least 1")
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
     run(arguments)
@@ -51,7 +51,7 @@ def run(arguments) -> None:
     from experiments.common.results import markdown_table, publish, write_json
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
-    from humangs_jax.io.text import read_json
+    from humangs_jax.io.reading import read_json
     from humangs_jax.network.weights import load_weights
 
     options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set", "seconds")}

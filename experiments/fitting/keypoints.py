@@ -47,7 +47,7 @@ def main() -> None:
         parser.error("--plot and --docs show the curves: add --curves")
     if not arguments.json.parent.is_dir():
         parser.error(f"--json {arguments.json}: the folder {arguments.json.parent} does not exist")
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
     run(arguments)

@@ -47,7 +47,7 @@ def main() -> None:
 def write_material(folder: Path, capture, points: np.ndarray) -> None:
     """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write them."""
     from humangs_jax.io.images import write_png
-    from humangs_jax.io.text import write_json
+    from humangs_jax.io.reading import write_json
 
     for name in ("images", "masks", "keypoints"):
         (folder / name).mkdir(parents=True)

@@ -84,7 +84,7 @@ def scores(inputs: Any, truth: Any) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+    from humangs_jax.evaluation.cases import draw_painted_body, painted_body
     from humangs_jax.losses.metrics import masked_psnr, psnr
     from humangs_jax.losses.ssim import similarity_map
 

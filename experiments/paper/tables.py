@@ -51,7 +51,7 @@ from experiments.paper.bench import (
     untrained_on_the_page,
 )
 from humangs_jax.evaluation.tables import mean_scores
-from humangs_jax.io.text import read_json
+from humangs_jax.io.reading import read_json
 
 COUNTS = (1, 2, 4, 6)
 SPLIT = ", on the other split"

@@ -74,7 +74,7 @@ def main() -> None:
         parser.error("--steps and --people must be at least 1, --budget positive")
     if arguments.quick:
         arguments.steps, arguments.people, arguments.validated = 20, 4, 2
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
     queue = variants(arguments.steps)

@@ -133,7 +133,7 @@ def compiled(
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
     from humangs_jax.rendering.splatting import render
 
     gaussians, camera = scene.gaussians(dtype), scene.camera(dtype)

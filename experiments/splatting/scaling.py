@@ -98,7 +98,7 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
     from humangs_jax.rendering.splatting import plan_buffers, render, render_views
 
     gaussians, cameras = scene.gaussians(), orbiting(scene, VIEW_ANGLE * np.arange(views))

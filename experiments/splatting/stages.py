@@ -53,7 +53,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
     from humangs_jax.rendering import binning
     from humangs_jax.rendering.compositing import pack_splats
     from humangs_jax.rendering.projection import project, squared_reach

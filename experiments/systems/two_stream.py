@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Few, Layers, Patch, Ratio, Vertices, Width, part
-from humangs_jax.geometry.curve import along_curve
+from humangs_jax.geometry.transform import along_curve
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
 from humangs_jax.network.runtime import Runtime

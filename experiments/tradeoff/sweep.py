@@ -175,7 +175,7 @@ class Bench:
         """The avatar of a point; those that only differ in how they are drawn are made once."""
         from experiments.evaluation.refinement import random_start
         from humangs_jax.apps.settings import reconstruct_with
-        from humangs_jax.evaluation.baseline import painted_body
+        from humangs_jax.evaluation.cases import painted_body
         from humangs_jax.refinement.refine import refine_with_report
 
         settings = dataclasses.replace(point.settings, splat="as_trained", prune=False)
@@ -199,7 +199,7 @@ class Bench:
         """Scores by task, of frames brought to the size of the truth."""
         from experiments.evaluation.subjects import score_tasks
         from humangs_jax.avatar.frames import capture_views, draw
-        from humangs_jax.evaluation.baseline import draw_painted_body
+        from humangs_jax.evaluation.cases import draw_painted_body
         from humangs_jax.io.images import resized
 
         truth = person.held_out
@@ -246,7 +246,7 @@ class Bench:
 
     def make_times(self, point) -> dict[str, Any]:
         """Time of making the avatar over the default's, with refinement; the default's ms; peak memory, MiB."""
-        from humangs_jax.core.allocator import peak_memory
+        from humangs_jax.core.processes import peak_memory
 
         settings, usual = point.settings, self.default.settings
         same = (settings.views, settings.runtime) == (usual.views, usual.runtime)
@@ -266,7 +266,7 @@ class Bench:
 
     def refining(self, settings) -> tuple[float, float | None]:
         """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
-        from humangs_jax.core.allocator import peak_memory
+        from humangs_jax.core.processes import peak_memory
         from humangs_jax.refinement.refine import refine_with_report
 
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
@@ -301,7 +301,7 @@ class Bench:
 
     def painted_times(self) -> dict[str, Any]:
         """Of the painted body: the mesh with its colors, rasterized."""
-        from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+        from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 
         photos, held_out = self.person(0).inputs(4), self.person(0).held_out
         one = held_out.select([0])
@@ -322,7 +322,7 @@ class Bench:
         """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
         from experiments.reconstruction.cases import random_variables
         from humangs_jax.apps.settings import reconstruct_with
-        from humangs_jax.core.allocator import peak_memory
+        from humangs_jax.core.processes import peak_memory
         from humangs_jax.network.presets import published
 
         config = published().with_conventions(image_size=256)

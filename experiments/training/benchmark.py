@@ -75,7 +75,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     from experiments.reconstruction.cases import matmul_program
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
 
     program, compile_s, costs = case.compiled(compiler_options())
     case.program = program

@@ -53,7 +53,7 @@ def main() -> None:
     counts = ("samples", "people", "steps", "iterations", "batch")
     if min(getattr(arguments, name) for name in counts) < 1:
         parser.error(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
-    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.processes import keep_freed_memory
 
     keep_freed_memory()
     try:
@@ -67,7 +67,7 @@ def main() -> None:
 
 def keep_settings(arguments: argparse.Namespace) -> None:
     """Write OUT/settings.json, or raise ValueError if the run there has others."""
-    from humangs_jax.io.text import read_json, write_json
+    from humangs_jax.io.reading import read_json, write_json
 
     path = arguments.out / "settings.json"
     settings = {name: str(x) if isinstance(x, Path) else x for name, x in vars(arguments).items() if name != "out"}
@@ -186,7 +186,7 @@ def compiled(function: Any) -> Any:
 
     import jax
 
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
 
     static = [name for name in ("splat",) if name in inspect.signature(function).parameters]
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
@@ -259,7 +259,7 @@ def view_gradient() -> Any:
     """((loss, squared error), gradient with respect to the parameters) of `view_loss`, jitted."""
     import jax
 
-    from humangs_jax.core.compiler_options import compiler_options
+    from humangs_jax.core.compiling import compiler_options
 
     differentiated = jax.value_and_grad(view_loss, has_aux=True)
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())

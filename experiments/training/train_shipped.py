@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.processes import keep_freed_memory
 from humangs_jax.training.config import TrainConfig, small
 
 sys.path.insert(0, str(Path(__file__).parents[2]))

@@ -27,10 +27,10 @@ from humangs_jax.core.progress import stage
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report

@@ -32,7 +32,7 @@ from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE, PEOPLE_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.json", "people.png", "masks"
 RIVAL = 0.35

@@ -14,7 +14,7 @@ import jax
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import (
     Few,
     Iterations,
@@ -29,8 +29,7 @@ from humangs_jax.core.configuration import (
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.view_selection import select_views
-from humangs_jax.io.reading import Refused, reading
-from humangs_jax.io.text import parse_json, read_text, write_json
+from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.runtime import RUNTIMES, Runtime

@@ -22,13 +22,13 @@ from humangs_jax.apps.settings import Settings, reconstruct_with, save_settings
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntable_views
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.core.allocator import peak_memory
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import Range, config_from_json, configuration
+from humangs_jax.core.processes import peak_memory
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import write_png
-from humangs_jax.io.text import parse_json
+from humangs_jax.io.reading import parse_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.refinement.config import RefineConfig

@@ -9,8 +9,7 @@ from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
 from humangs_jax.data.calibration.videos import find_videos, grey_frames, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.reading import reading
-from humangs_jax.io.text import read_json, write_json
+from humangs_jax.io.reading import read_json, reading, write_json
 
 MARK = "video.json"
 """In the folder of photos: the video that they are of."""

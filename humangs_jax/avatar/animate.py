@@ -6,8 +6,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import light_values, relit
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
-from humangs_jax.core.arguments import checked_arguments
-from humangs_jax.core.checks import FINITE, check_values
+from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, skin_gaussians
 

@@ -15,8 +15,7 @@ from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
 from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, check_row_sums, checksum
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.io.reading import FileError, Refused, reading
-from humangs_jax.io.text import parse_json
+from humangs_jax.io.reading import FileError, Refused, parse_json, reading
 from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"

@@ -13,8 +13,8 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace

@@ -15,8 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import FINITE, Values
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.geometry.curve import along_curve
-from humangs_jax.geometry.transform import EXACT
+from humangs_jax.geometry.transform import EXACT, along_curve
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 TERMS = 8

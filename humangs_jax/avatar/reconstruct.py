@@ -16,9 +16,8 @@ from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log
 from humangs_jax.avatar.low_pass import with_low_pass
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
-from humangs_jax.core.checks import FINITE, UNIT, check_values
+from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure

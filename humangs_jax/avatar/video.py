@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import to_uint8, write_png

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
 
 FLATNESS = 100.0

@@ -32,8 +32,8 @@ from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.places import Place
 from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.arguments import checked_arguments
-from humangs_jax.core.checks import LARGEST
+from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, check_limit, open_file, reading

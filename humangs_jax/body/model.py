@@ -11,8 +11,8 @@ package another (`humangs_jax.body.library.load_body`).
 import jax.numpy as jnp
 
 from humangs_jax.body import skinning
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 

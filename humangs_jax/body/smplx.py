@@ -19,8 +19,7 @@ from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.array_file import ArrayFile
-from humangs_jax.io.arrays import check_row_sums
+from humangs_jax.io.arrays import ArrayFile, check_row_sums
 from humangs_jax.io.reading import FileError, reading
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100

@@ -71,9 +71,9 @@ def main() -> None:
 
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help and what tyro refuses."""
-    from humangs_jax.cli import interrupts, screen
+    from humangs_jax.cli import screen
 
-    interrupts.heard.clear()
+    screen.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
     given, arguments = everywhere & set(arguments), [word for word in arguments if word not in everywhere]
     verbose = "--verbose" in given
@@ -93,7 +93,7 @@ def execute(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return _interrupted()
     except Exception as error:
-        if interrupts.heard.is_set():  # importing an extension makes another error of it
+        if screen.heard.is_set():  # importing an extension makes another error of it
             return _interrupted()
         if isinstance(error, ValueError | OSError):
             return _failed(error, verbose)
@@ -108,12 +108,11 @@ def execute(arguments: Sequence[str]) -> int:
 
 def _prepare(verbose: bool) -> None:
     """Settings of the process."""
-    from humangs_jax.cli.interrupts import end_within_seconds
+    from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
-    from humangs_jax.cli.screen import silence
-    from humangs_jax.core.allocator import keep_freed_memory
-    from humangs_jax.core.compile_cache import enable_compile_cache
+    from humangs_jax.core.compiling import enable_compile_cache
+    from humangs_jax.core.processes import keep_freed_memory
 
     silence(verbose)
     keep_freed_memory()

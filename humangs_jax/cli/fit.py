@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.detect import found_here, tell_found
+from humangs_jax.cli.captures import found_here, tell_found
 from humangs_jax.cli.options import (
     UsageError,
     require_at_least,

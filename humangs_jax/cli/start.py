@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from humangs_jax.cli.detect import tell_found
+from humangs_jax.cli.captures import tell_found
 from humangs_jax.cli.options import (
     ITERATIONS_ALONE,
     UsageError,
@@ -130,7 +130,7 @@ class Start:
         with stage("finding the person and the cameras"):
             from humangs_jax.apps.detect import SHEET_FILE
             from humangs_jax.apps.photos_alone import import_photos
-            from humangs_jax.io.text import write_json
+            from humangs_jax.io.reading import write_json
 
             own_masks = not (self.without_masks or material.alpha or material.masks)
             found = import_photos(
@@ -206,7 +206,7 @@ class Start:
         """Photos and cameras as a capture folder."""
         with stage("importing photos and cameras"):
             from humangs_jax.data.calibration.importing import import_cameras
-            from humangs_jax.io.text import write_json
+            from humangs_jax.io.reading import write_json
 
             assert material.cameras is not None
             report = import_cameras(

@@ -1,16 +1,21 @@
-"""Checks of the values that users hand in: finite, and in range.
+"""Checks of what users hand in: arguments of the right class with shapes that fit each other, and values that are finite and in
+range.
 
-    check_values("render", {"gaussians.opacities": (gaussians.opacities, UNIT), "camera.K": (camera.K, FINITE)})
-
+    render(gaussians, camera, ...): gaussians: expected Gaussians, got Avatar; animate(avatar, pose) poses them
     ValueError: render: gaussians.opacities: expected numbers in [0, 1], but 2 of 52375 are not, the first at [17]: nan
 
-For functions that people call with concrete arrays. Inside `jit`, `vmap` and `grad` arrays have no values yet: there nothing
-is checked and nothing is computed, so the pure function behind a public one needs no switch.
+Classes and shapes are known inside transformations, too, and checking them computes nothing. Values are there only outside of
+`jit`, `vmap` and `grad`: inside nothing is checked, so the pure function behind a public one needs no switch.
 """
 
+import dataclasses
+import functools
+import inspect
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +23,132 @@ import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Shaped
+from humangs_jax.core.pytree import shape_fault
+
+P = ParamSpec("P")
+T = TypeVar("T")
+NUMBERS = (int, float, complex, bool)
+"""Not checked: those of numpy and JAX do as well."""
+SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable}
+"""What lists of something may be; what is in them is not checked."""
+HINTS = {
+    ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
+    ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
+    ("Avatar", "tuple"): "reconstruct_views returns (avatar, dropped)",
+    ("Avatar", "list"): "one at a time",
+    ("Camera", "Capture"): "it has a batch of them, capture.cameras",
+    ("Camera", "list"): "stack_cameras makes a batch of them",
+    ("BodyPose", "Capture"): "capture.pose(frame) is one",
+    ("BodyPose", "Motion"): "motion.pose(frame) is one",
+    ("SubjectViews", "Capture"): "stack_captures makes them",
+    ("Sequence", "Camera"): "a list of cameras",
+    ("Sequence", "Capture"): "a list of captures",
+    ("HumanGSConfig", "tuple"): "load_weights returns (variables, config)",
+}
+"""What to do, by the class that is expected and the class that was given."""
+
+
+def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit each other.
+
+    Parameters that may be something else than plain classes, sequences or arrays (numbers, callables) are left alone.
+    Raises: TypeError, one line, for another class or a name that the function does not have; ValueError for shapes, and for
+    a batch of what functions take one of (`one_at_a_time`).
+    """
+    signature = inspect.signature(function)
+    expected = {name: found for name, p in signature.parameters.items() if (found := _classes(p.annotation))}
+    arrays = {name: found for name, p in signature.parameters.items() if (found := _arrays(p.annotation))}
+    call = _call(function, signature)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError as error:
+            raise TypeError(f"{call}: {_of_a_field(kwargs, signature, expected) or error}") from None
+        for name, classes in expected.items():
+            if name not in given:
+                continue
+            value = given[name]
+            if not isinstance(value, classes):
+                raise TypeError(f"{call}: {name}: {_other_class(classes, value)}")
+            if getattr(value, "one_at_a_time", False) and value.batch_shape:
+                raise ValueError(
+                    f"{call}: {name}: expected one {type(value).__name__}, got a batch {value.batch_shape}: take one, "
+                    f"{name}[0], or use jax.vmap"
+                )
+            if fault := shape_fault(value):
+                raise ValueError(f"{call}: {name}{fault}")
+        for name in arrays.keys() & given.keys():
+            if fault := _no_array(arrays[name], given[name]):
+                raise (ValueError if hasattr(given[name], "shape") else TypeError)(f"{call}: {name}: {fault}")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _arrays(annotation: Any) -> tuple[Any, ...]:
+    """The types of arrays that an annotation stands for, with None where it may be that; none if it may be something else."""
+    options = typing.get_args(annotation) or (annotation,)
+    known = all(hasattr(x, "dims") or x is type(None) for x in options)
+    return options if known and any(hasattr(x, "dims") for x in options) else ()
+
+
+def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
+    """What is wrong with a value that should be an array; numbers are arrays without axes."""
+    if value is None and type(None) in options:
+        return None
+    types_ = [x for x in options if hasattr(x, "dims")]
+    shape = getattr(value, "shape", () if isinstance(value, NUMBERS) else None)
+    ranks = {len(x.dims) for x in types_ if isinstance(x.dims, tuple) and x.index_variadic is None}
+    if shape is not None and (len(ranks) < len(types_) or len(shape) in ranks):
+        return None
+    axes = " or ".join(f"({', '.join(str(x.dim_str).split())})" for x in types_)
+    given = f"{type(value).__name__}; jnp.asarray makes one" if shape is None else str(shape)
+    return f"expected an array of shape {axes}, got {given}"
+
+
+def _classes(annotation: Any) -> tuple[type, ...]:
+    """The classes that an annotation stands for; none if that is not all that it says."""
+    union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+    options = typing.get_args(annotation) if union else (annotation,)
+    options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
+    plain = [isinstance(x, type) and not typing.get_args(x) and not hasattr(x, "dims") for x in options]
+    known = [x not in (*NUMBERS, inspect.Parameter.empty, object, Any) for x in options]
+    protocol = [getattr(x, "_is_protocol", False) and not getattr(x, "_is_runtime_protocol", False) for x in options]
+    return options if all(plain) and all(known) and not any(protocol) else ()
+
+
+def _call(function, signature):
+    """The function with its parameters: those without a default, the others as dots."""
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    parameters = signature.parameters.values()
+    needed = [p.name for p in parameters if p.kind in kinds and p.default is inspect.Parameter.empty]
+    more = ["..."] if len(needed) < len(parameters) else []
+    return f"{getattr(function, '__name__', 'function')}({', '.join(needed + more)})"
+
+
+def _other_class(classes, value):
+    names = [x.__name__ for x in classes if x is not type(None)]
+    given = "None" if value is None else value.__name__ if isinstance(value, type) else type(value).__name__
+    shown = (
+        f" {value!r}" if isinstance(value, str) else f" the class {given}" if isinstance(value, type) else f" {given}"
+    )
+    hint = next((HINTS[pair] for name in names if (pair := (name, given)) in HINTS), None)
+    return f"expected {' or '.join(names)}, got{shown}{f'; {hint}' if hint else ''}"
+
+
+def _of_a_field(keywords, signature, expected):
+    """Where a name belongs that the function does not have: into one of its configurations."""
+    for name in keywords:
+        if name in signature.parameters:
+            continue
+        for parameter, classes in expected.items():
+            for x in classes:
+                if dataclasses.is_dataclass(x) and name in x.__dataclass_fields__:
+                    return f"no argument {name!r}: it is a field of {x.__name__}, {parameter}={x.__name__}({name}=...)"
+        return f"no argument {name!r}; its arguments are {', '.join(signature.parameters)}"
+    return None
 
 
 class Values(NamedTuple):

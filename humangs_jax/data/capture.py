@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
 from humangs_jax.data.capture_checks import (
     CaptureError,

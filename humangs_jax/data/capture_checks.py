@@ -11,8 +11,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import check_replaceable
-from humangs_jax.io.reading import FileError, reading, shown
-from humangs_jax.io.text import parse_json, read_text
+from humangs_jax.io.reading import FileError, parse_json, read_text, reading, shown
 
 COLOR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""

@@ -22,8 +22,7 @@ from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.rims import clean_rims
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, orientation, read_grey, read_image
-from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown, write_json
 
 logger = logging.getLogger(__name__)
 

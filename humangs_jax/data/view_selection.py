@@ -7,8 +7,8 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.subdivision import vertex_areas
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.usable_views import usable_indices
 from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize

@@ -12,8 +12,8 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.subdivision import split_long_edges
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box

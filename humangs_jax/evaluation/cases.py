@@ -15,8 +15,8 @@ from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.targets import show_targets
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import open_people
@@ -24,9 +24,16 @@ from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.photos import capture_folder
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_image
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
+from humangs_jax.network.pixel_aligned import (
+    photo_colors,
+    project_vertices,
+    visible_vertices,
+)
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
 """A capture in this folder of another one has views that are no inputs; `humangs synth` writes them."""
@@ -363,3 +370,41 @@ def choose_method(
     if weights is None:
         return "shipped weights", weights_method(*shipped_weights())
     return "weights", weights_method(*weights)
+
+
+def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
+    """A color for each vertex of the body: the mean photo color over the views that see it, grey where none does."""
+    body = inputs.body
+    rest = shape_body(body, jnp.asarray(inputs.betas))
+    size = (inputs.cameras.width, inputs.cameras.height)
+
+    def view(frame, camera):
+        vertices = _posed_vertices(inputs, rest, frame)
+        pixels, depths = project_vertices(camera, vertices)
+        depth_map = rasterize_mesh(vertices, body.faces, camera).depth
+        return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
+
+    seen = [view(int(frame), inputs.cameras[i]) for i, frame in enumerate(inputs.frames)]
+    pixels, visible = (jnp.stack(x) for x in zip(*seen, strict=True))
+    return photo_colors(jnp.asarray(inputs.images), pixels, visible, "half_pixel")
+
+
+def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
+    """The painted body mesh on white, in the poses and from the cameras of a capture."""
+    body = views.body
+    rest = shape_body(body, jnp.asarray(views.betas))
+
+    def draw(frame: int, camera: Camera):
+        fragments = rasterize_mesh(_posed_vertices(views, rest, frame), body.faces, camera)
+        return np.asarray(interpolate_attributes(fragments, body.faces, colors, jnp.ones(3)))
+
+    return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
+
+
+def _posed_vertices(capture, rest, frame):
+    return _pose(capture.body, rest, capture.pose(frame))
+
+
+@jax.jit
+def _pose(body, rest, pose: BodyPose):
+    return pose_body(body, rest, pose).vertices

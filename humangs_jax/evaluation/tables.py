@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.core.printable import printable
+from humangs_jax.core.progress import printable
 
 Row = dict[str, float | None]
 """Scores by name; None for what is missing."""

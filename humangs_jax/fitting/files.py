@@ -30,8 +30,7 @@ from humangs_jax.fitting.report import FitReport, listed
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.io.reading import reading
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"

@@ -16,8 +16,7 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import Refused, reading
-from humangs_jax.io.text import read_json
+from humangs_jax.io.reading import Refused, read_json, reading
 
 VIEWS = 48
 """Directions from which points are looked at."""

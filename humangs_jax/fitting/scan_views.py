@@ -22,8 +22,7 @@ from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
-from humangs_jax.io.reading import Refused, reading
-from humangs_jax.io.text import read_json, write_json
+from humangs_jax.io.reading import Refused, read_json, reading, write_json
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SCAN_FILE, PLACEMENT = "scan.json", "world_from_scan"

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
-from humangs_jax.core.checks import FINITE, POSITIVE, Values
+from humangs_jax.core.checks import FINITE, POSITIVE, Values, checked_arguments
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 
-from humangs_jax.core.signals import undisturbed
+from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.tensor_file import read_tensors
+from humangs_jax.io.tensors import read_tensors
 from humangs_jax.losses.perceptual import (
     BACKBONES,
     VGG19,

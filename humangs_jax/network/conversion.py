@@ -1,6 +1,6 @@
 """The authors' released checkpoint to our variables and back: names, layouts, and the configuration behind the shapes.
 
-Files are read by `io.tensor_file`, without torch. Layouts: linear (out, in) -> (in, out); convolution
+Files are read by `io.tensors`, without torch. Layouts: linear (out, in) -> (in, out); convolution
 (out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed convolution
 (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
 """
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from humangs_jax.io.reading import reading
-from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
+from humangs_jax.io.tensors import is_safetensors, read_safetensors, read_tensors
 from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.parts import Variables

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose, Texels
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.io.arrays import check_checksum, checksum
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.reading import reading
-from humangs_jax.io.tensor_file import read_safetensors
+from humangs_jax.io.tensors import read_safetensors
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables

@@ -17,7 +17,7 @@ import numpy as np
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Float, UInt8
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 from humangs_jax.people.kinematics import HEAD
 from humangs_jax.people.rendering import PosedSubject, light_points, paint, pose_subject, spots_at
 from humangs_jax.people.subject import SyntheticSubject

@@ -14,9 +14,9 @@ import numpy as np
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
+from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.core.workers import in_processes
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading

@@ -22,7 +22,7 @@ from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.compiler_options import compiler_options
+from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace

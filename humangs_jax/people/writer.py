@@ -18,17 +18,16 @@ import numpy as np
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import say
-from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.data.preprocess.run import FORMAT as OF_A_DATA_SET
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
-from humangs_jax.io.reading import shown
-from humangs_jax.io.text import read_json, write_json
+from humangs_jax.io.reading import read_json, shown, write_json
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations

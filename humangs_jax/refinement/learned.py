@@ -26,7 +26,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.tensor_file import read_safetensors
+from humangs_jax.io.tensors import read_safetensors
 from humangs_jax.refinement.objective import Image, Photos, drawn_photo
 from humangs_jax.refinement.parameters import Parameters
 from humangs_jax.rendering.splat_config import SplatConfig

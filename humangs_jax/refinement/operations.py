@@ -20,7 +20,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Int
-from humangs_jax.core.compiler_options import compiler_options
+from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.losses.metrics import decibels

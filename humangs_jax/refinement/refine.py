@@ -15,8 +15,8 @@ from jax.sharding import Mesh
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without_low_pass
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import SubjectViews

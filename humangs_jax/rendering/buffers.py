@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Int
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import binning

@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.geometry.svd3 import left_singular_vectors
+from humangs_jax.geometry.quaternion import left_singular_vectors
 from humangs_jax.rendering.constants import EPS2D, MIP_EPS2D
 
 THINNEST = 1e-5

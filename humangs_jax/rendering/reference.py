@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import LARGEST_FOOTPRINT

@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Bool
-from humangs_jax.core.checks import FINITE, check_values
-from humangs_jax.core.compiler_options import compiler_options
+from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.compiling import compiler_options
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.buffers import (

@@ -25,8 +25,7 @@ import numpy as np
 
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.reading import FileError, Refused, reading
-from humangs_jax.io.text import read_json
+from humangs_jax.io.reading import FileError, Refused, read_json, reading
 from humangs_jax.training.config import TrainConfig, read_config
 from humangs_jax.training.state import TrainState
 

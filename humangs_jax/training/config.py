@@ -21,7 +21,7 @@ from humangs_jax.core.configuration import (
     knob,
 )
 from humangs_jax.data.loader import ViewSampling
-from humangs_jax.io.text import read_configuration
+from humangs_jax.io.reading import read_configuration
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig

@@ -21,8 +21,7 @@ from humangs_jax.core.progress import bar, watched
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.io.reading import reading
-from humangs_jax.io.text import parse_json, read_text
+from humangs_jax.io.reading import parse_json, read_text, reading
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.stages import Named, Recorder, inexact_leaves

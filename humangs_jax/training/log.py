@@ -20,8 +20,7 @@ import numpy as np
 from humangs_jax.core.progress import bar, say
 from humangs_jax.data.loader import Waiting
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.reading import Refused, reading
-from humangs_jax.io.text import parse_json, read_text
+from humangs_jax.io.reading import Refused, parse_json, read_text, reading
 from humangs_jax.training.state import TrainState
 
 logger = logging.getLogger("humangs_jax.training")

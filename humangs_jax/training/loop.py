@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.progress import say, stage
 from humangs_jax.data.loader import Waiting
 from humangs_jax.data.views import gaussian_body

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
-from humangs_jax.core.compiler_options import compiler_options
+from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews

@@ -22,15 +22,14 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError, config_from_json
-from humangs_jax.core.printable import printable
-from humangs_jax.core.progress import say
+from humangs_jax.core.progress import printable, say
 from humangs_jax.data.motion import Motion, grounded, load_motion
 from humangs_jax.data.motion.rules import page_rules
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.tensor_file import read_safetensors
+from humangs_jax.io.tensors import read_safetensors
 from humangs_jax.network.config import Conventions, HumanGSConfig
 from humangs_jax.network.weights import SHIPPED
 from humangs_jax.viewer.packing import fitted_shape, pack

@@ -30,7 +30,7 @@ from humangs_jax.body.model import RestBody
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
-from humangs_jax.io.glb import parse_glb, read_accessor
+from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.rendering.gaussians import Gaussians
 
 VALIDATOR = Path(os.environ.get("HUMANGS_NPM", ".")) / "node_modules" / "gltf-validator"

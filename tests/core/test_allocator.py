@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 
-from humangs_jax.core.allocator import peak_memory
+from humangs_jax.core.processes import peak_memory
 
 PROGRAM = """
 import resource
 import sys
 import numpy as np
-from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.processes import keep_freed_memory
 
 kept = keep_freed_memory() if sys.argv[1] == "keep" else False
 faults = []

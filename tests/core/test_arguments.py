@@ -15,7 +15,7 @@ import humangs_jax as hg
 from humangs_jax.avatar.export.gaussians import write_ply
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
-from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras

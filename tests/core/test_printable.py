@@ -11,11 +11,11 @@ import pytest
 
 import humangs_jax
 from humangs_jax.core import progress
-from humangs_jax.core.printable import printable
+from humangs_jax.core.progress import printable
 from humangs_jax.io.reading import FileError
 
 PACKAGE = Path(humangs_jax.__file__).parent
-OWN = ("core/progress.py", "cli/interrupts.py")
+OWN = ("core/progress.py", "cli/screen.py")
 """The door, and what is written while the process ends at once."""
 
 

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from humangs_jax.core.signals import started_deaf, undisturbed
+from humangs_jax.core.processes import started_deaf, undisturbed
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signals of POSIX")
 

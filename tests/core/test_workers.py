@@ -8,7 +8,7 @@ import time
 
 POOL = """
 import concurrent.futures, multiprocessing, os, time
-from humangs_jax.core.workers import end_with_parent
+from humangs_jax.core.processes import end_with_parent
 if __name__ == "__main__":
     end_with_parent()  # of no pool: nothing happens
     context = multiprocessing.get_context("spawn")

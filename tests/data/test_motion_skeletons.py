@@ -27,7 +27,7 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import MotionError, load_motion
 from humangs_jax.data.motion.bvh import read_bvh
 from humangs_jax.data.motion.skeleton import retargeted, shipped_joints
-from humangs_jax.io.glb import GlbWriter
+from humangs_jax.io.mesh import GlbWriter
 
 EXACT = 1e-5
 """Radians and metres: float32, and BVH's eight decimals."""

@@ -132,9 +132,9 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
     monkeypatch.setattr("humangs_jax.avatar.reconstruct.reconstruct", reconstructed)
     drawn = lambda avatar, views: held_out.append(views) or SimpleNamespace(images=drawings["ours"](views))
     monkeypatch.setattr("humangs_jax.evaluation.cases.draw_views", drawn)
-    monkeypatch.setattr("humangs_jax.evaluation.baseline.painted_body", lambda inputs: None)
+    monkeypatch.setattr("humangs_jax.evaluation.cases.painted_body", lambda inputs: None)
     monkeypatch.setattr(
-        "humangs_jax.evaluation.baseline.draw_painted_body", lambda colors, views: drawings["painted"](views)
+        "humangs_jax.evaluation.cases.draw_painted_body", lambda colors, views: drawings["painted"](views)
     )
     page, out, sheet = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
     page.write_text("<!-- table: evaluation_bodies -->\n<!-- end -->\n")

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.geometry.curve import along_curve
+from humangs_jax.geometry.transform import along_curve
 
 
 def test_neighbours_along_the_curve_are_neighbours_in_space():

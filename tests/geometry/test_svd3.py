@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rounding import bound
 
-from humangs_jax.geometry.svd3 import left_singular_vectors
+from humangs_jax.geometry.quaternion import left_singular_vectors
 
 FLOAT32_TOLERANCE = 2e-5  # a dozen roundings of 6e-8 in each of six sweeps, relative to the largest singular value
 FLOAT64_TOLERANCE = 1e-13

@@ -47,13 +47,12 @@ from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.fitting.scan_views import read_placement
-from humangs_jax.io.glb import GlbWriter
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
+from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.tensor_file import read_tensors
-from humangs_jax.io.text import read_json
+from humangs_jax.io.tensors import read_tensors
 from humangs_jax.losses.loss_networks import load_vgg19
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from humangs_jax.core.printable import printable
+from humangs_jax.core.progress import printable
 
 HERE = Path(__file__).parent
 WORKER_SECONDS = 1800

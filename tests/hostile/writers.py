@@ -543,10 +543,10 @@ def hear_from_the_start(cli, tell):
 
     The audit hook is Python that a user's run does not have, also where extensions allow no exception: none is raised in it.
     """
-    from humangs_jax.cli import interrupts
+    from humangs_jax.cli import screen
 
-    importing, hook = interrupts._importing, Changes.audit.__code__
-    mock.patch.object(interrupts, "_importing", lambda frame: frame.f_code is hook or importing(frame)).start()
+    importing, hook = screen._importing, Changes.audit.__code__
+    mock.patch.object(screen, "_importing", lambda frame: frame.f_code is hook or importing(frame)).start()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     prepare = cli._prepare

@@ -17,13 +17,14 @@ from humangs_jax.io.reading import (
     check_limit,
     inside,
     limits,
+    parse_json,
     read_bytes,
+    read_json,
     reading,
     set_limits,
     shown,
     walk,
 )
-from humangs_jax.io.text import parse_json, read_json
 
 DOCS = Path(__file__).parents[2] / "docs" / "security.md"
 

@@ -3,7 +3,7 @@ import pytest
 from safetensors.numpy import save_file
 from torch_writer import tensors, write_checkpoint, write_stream
 
-from humangs_jax.io.tensor_file import is_safetensors, read_tensors
+from humangs_jax.io.tensors import is_safetensors, read_tensors
 
 STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
 WRITERS = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from torch_writer import FakeTensor, pickled, write_checkpoint, write_python2_stream, write_stream
 
-from humangs_jax.io.torch_file import read_torch_file
+from humangs_jax.io.tensors import read_torch_file
 
 DATA = Path(__file__).parent / "data"
 FORMATS = pytest.mark.parametrize("write", [write_checkpoint, write_stream])

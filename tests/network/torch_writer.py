@@ -12,7 +12,7 @@ from unittest import mock
 
 import numpy as np
 
-from humangs_jax.io.torch_file import MAGIC_NUMBER, STORAGE_DTYPES, STREAM_VERSION
+from humangs_jax.io.tensors import MAGIC_NUMBER, STORAGE_DTYPES, STREAM_VERSION
 
 KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloat16Storage"}
 

@@ -26,14 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.export import Up
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
-from humangs_jax.core.checks import BOUNDED, check_values
+from humangs_jax.core.checks import BOUNDED, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.io.atomic import replace_file, write_bytes
-from humangs_jax.io.glb import VERTICES, GlbWriter
+from humangs_jax.io.mesh import VERTICES, GlbWriter
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, widened
 
 SH_C0 = 0.28209479177387814

@@ -30,8 +30,8 @@ from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.glb import INDICES, VERTICES, GlbWriter
 from humangs_jax.io.images import write_png
+from humangs_jax.io.mesh import INDICES, VERTICES, GlbWriter
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 

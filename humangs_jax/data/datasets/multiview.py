@@ -27,7 +27,7 @@ from humangs_jax.data.datasets.subject import Subject
 from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import read_grey, read_image
-from humangs_jax.io.text import read_text
+from humangs_jax.io.reading import read_text
 
 PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255

@@ -25,8 +25,7 @@ from humangs_jax.data.datasets.values import checked_numbers, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size, read_grey, read_image
 from humangs_jax.io.npz import write_npz
-from humangs_jax.io.reading import inside, reading, shown
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import inside, reading, shown, write_json
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255

@@ -26,8 +26,7 @@ from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPers
 from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
 from humangs_jax.io.images import check_image
 from humangs_jax.io.mesh import read_meshes
-from humangs_jax.io.reading import Refused, reading
-from humangs_jax.io.text import read_text
+from humangs_jax.io.reading import Refused, read_text, reading
 
 Kind = Literal["A", "B", "C"]
 PCA_NUMBERS, HAND_NUMBERS = 12, 45

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.io import array_file
+from humangs_jax.io import arrays
 
 LARGEST_ANGLE = 4 * np.pi
 """Radians of a rotation vector; fits wander beyond 2 pi now and then, degrees are far above."""
@@ -14,5 +14,5 @@ FARTHEST = 100.0
 LARGEST_COEFFICIENT = 30.0
 """Of shape and expression: standard deviations, usually below 5."""
 
-open_arrays = functools.partial(array_file.ArrayFile.open, error=CaptureError)
-checked_numbers = functools.partial(array_file.checked_numbers, error=CaptureError)
+open_arrays = functools.partial(arrays.ArrayFile.open, error=CaptureError)
+checked_numbers = functools.partial(arrays.checked_numbers, error=CaptureError)

@@ -19,7 +19,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json, required
 from humangs_jax.data.keypoints.sets import KEYPOINT_SETS, MEDIAPIPE_33, KeypointSet
 from humangs_jax.detection.people import DetectedPerson
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 
 FORMAT, VERSION = "humangs-people", 1
 DECIMALS = 4

@@ -28,9 +28,8 @@ from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion.motion import MotionError
 from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, FORMATS, HAND_NUMBERS, MILLIMETRES
-from humangs_jax.io.array_file import ArrayFile
-from humangs_jax.io.reading import open_file
-from humangs_jax.io.text import read_json
+from humangs_jax.io.arrays import ArrayFile
+from humangs_jax.io.reading import open_file, read_json
 
 
 def read_arrays(path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked
-from humangs_jax.io.text import read_text
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_text
 
 CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 _WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")

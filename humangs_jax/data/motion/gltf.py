@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from humangs_jax.data.motion.rules import DEFAULT_FPS
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
-from humangs_jax.io.glb import parse_glb, read_accessor
+from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}

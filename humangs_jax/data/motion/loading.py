@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.smplx import HandBasis
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.motion import arrays, rules, skeleton, world
 from humangs_jax.data.motion.bvh import read_bvh

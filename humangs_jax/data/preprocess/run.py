@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
-from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture_checks import CaptureError, checked_json, required
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
@@ -23,8 +23,7 @@ from humangs_jax.data.datasets.scene_list import write_list
 from humangs_jax.data.datasets.thuman import ThumanSet, open_thuman
 from humangs_jax.data.preprocess.protocol import INPUT_COUNTS, TARGETS, evaluation_indices, split_ids
 from humangs_jax.data.preprocess.scenes import SCENE, Settings, write_scan, write_video
-from humangs_jax.io.reading import shown
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import shown, write_json
 
 MANIFEST, SKIPPED = "manifest.json", "skipped"
 FORMAT, VERSION = "humangs-dataset", 1

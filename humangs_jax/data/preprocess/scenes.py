@@ -48,7 +48,7 @@ from humangs_jax.data.preprocess.rendering import ScanRenderer
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
 from humangs_jax.io.npz import write_npz
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 
 SCENE, CAPTURE = "scene.json", "capture.json"
 Layout = Literal["scenes", "capture"]

@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import Range, Spread, configuration
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera

@@ -7,7 +7,7 @@ chain in registers. T only falls, so "T_k+1 > stop" needs no flag for stopped pi
 loop carries -T, which keeps the final T and marks the pixel as done.
 
 The blocks are small because padding is what small lists cost: a block works as long as its longest list, and stops
-early only when all its pixels are done. Compile with `core.compiler_options`: its kernels take microseconds, so
+early only when all its pixels are done. Compile with `core.compiling`: its kernels take microseconds, so
 that sharing each out over threads costs more than it gains, and the barriers below have to be kept.
 """
 

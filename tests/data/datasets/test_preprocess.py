@@ -9,7 +9,7 @@ import pytest
 from dataset_files import CAMERAS, FRAMES, model_arrays, write_avatarrex, write_model, write_thuman, write_thuman4
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.cli.preprocess import Preprocess, ScanViews
+from humangs_jax.cli.training import Preprocess, ScanViews
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.bodies import posed_people
 from humangs_jax.data.datasets.opening import open_people

@@ -31,7 +31,7 @@ from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, Source, ViewSampling
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.io.images import write_png
-from humangs_jax.io.text import write_json
+from humangs_jax.io.reading import write_json
 from humangs_jax.training.config import tiny
 from humangs_jax.training.sources import people_on_disk, training_people
 from humangs_jax.training.validation import validation_examples

@@ -1,12 +1,13 @@
-"""Tensors of a file that `torch.save` wrote, without torch and without running anything in it.
+"""Named tensors of a file: safetensors, or either format of `torch.save`, without torch and without running anything in it.
 
-The unpickler (`restricted_pickle`) knows the calls which rebuild the tensors of a state dict and refuses every other name. What
-those calls return is immutable, so that no later instruction of the pickle can change it. A tensor comes out as a description: a
-view of a storage, whose numbers lie elsewhere in the file. Only the storages of wanted tensors are read.
+The first bytes of a file decide; its name does not matter. For torch's formats the unpickler (`restricted_pickle`) knows the
+calls which rebuild the tensors of a state dict and refuses every other name. What those calls return is immutable, so that no
+later instruction of the pickle can change it. A tensor comes out as a description: a view of a storage, whose numbers lie
+elsewhere in the file. Only the storages of wanted tensors are read.
 
-Both formats are read. Since torch 1.6 it is a zip archive of the pickle and one member per storage. Before (and in what
-the lpips wheel ships) it is a stream: three pickles of a magic number, a version and the byte order; the pickle itself;
-a pickled list of the storages' names; then of each storage the count of its numbers and the numbers.
+Since torch 1.6 a file is a zip archive of the pickle and one member per storage. Before (and in what the lpips wheel ships) it is
+a stream: three pickles of a magic number, a version and the byte order; the pickle itself; a pickled list of the storages' names;
+then of each storage the count of its numbers and the numbers.
 """
 
 import io
@@ -17,6 +18,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -287,3 +289,34 @@ def _read_tensors(tensors: dict[str, _Tensor], size: int, read: Callable[[str, _
             if left < 0:
                 raise Refused(f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file")
     return {key: arrays[key] for key in tensors}
+
+
+def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
+    """The tensors whose name is wanted, and how many others the file has. Nothing in the file is run.
+
+    Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for more than tensors.
+    """
+    return read_safetensors(path, wanted)[:2] if is_safetensors(path) else read_torch_file(path, wanted)
+
+
+def is_safetensors(path: str | os.PathLike) -> bool:
+    """Whether a file begins as safetensors files do: with the length of a JSON object, and its brace."""
+    with reading(path, "file of tensors"), open_file(path) as file:
+        start = file.read(9)
+    return start[8:] == b"{" and struct.unpack("<Q", start[:8])[0] < 1 << 32
+
+
+def read_safetensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int, dict[str, str]]:
+    """The tensors whose name is wanted, how many others the file has, and the strings in its header.
+
+    Raises: FileNotFoundError; FileError.
+    """
+    from safetensors import safe_open
+
+    with reading(path, "safetensors file"):
+        with open_file(path) as start:
+            check_limit("slow_text_bytes", int.from_bytes(start.read(8), "little"), "bytes of a header")
+        with safe_open(Path(path), framework="numpy") as file:
+            keys = list(file.keys())
+            tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}
+            return tensors, len(keys) - len(tensors), file.metadata() or {}

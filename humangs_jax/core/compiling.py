@@ -1,6 +1,7 @@
-"""Compiled programs kept on disk between runs: a program of this package takes seconds to a minute to compile.
+"""How XLA compiles: programs kept on disk between runs, and options for a CPU.
 
-JAX has the cache; this module decides where it lies and how large it may grow.
+A program of this package takes seconds to a minute to compile. JAX has the cache; this module decides where it lies and how large
+it may grow.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 VARIABLE, OF_JAX = "HUMANGS_COMPILE_CACHE", "JAX_COMPILATION_CACHE_DIR"
 LARGEST = 2 << 30
@@ -80,3 +82,21 @@ def _delete_oldest(root: Path, largest: int) -> None:
             break
         file.unlink(missing_ok=True)  # another program may be doing the same
         total -= stat.st_size
+
+
+CPU_COMPILER_OPTIONS = {
+    "xla_cpu_prefer_vector_width": 512,
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting",
+}
+"""`jax.jit(..., compiler_options=compiler_options())` of a program that draws on a CPU: wide vectors make the loops over
+pixels up to a third faster where there is AVX-512; XLA no longer divides its small kernels, tens of microseconds each,
+among several threads, which took twice the CPU time and gained nothing; and it keeps barriers, so that tables are stored
+before they are gathered from (the loops of tiny images must then not become single kernels, which know no barriers).
+Eager calls use it; your own jitted functions need it themselves. Works from jax 0.10 to 0.12."""
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """`CPU_COMPILER_OPTIONS` if the default backend is the CPU, else None. Call it late: asking for the backend starts it."""
+    import jax
+
+    return CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
