@@ -30,7 +30,7 @@ class Command(Protocol):
 
 COMMANDS = {
     "start": "start.Start",
-    "detect": "detect.Detect",
+    "detect": "captures.Detect",
     "import": "captures.ImportCameras",
     "fit": "fit.Fit",
     "check": "fit.Check",
@@ -44,7 +44,7 @@ COMMANDS = {
     "evaluate": "evaluate.Evaluate",
     "view": "animate.View",
     "synth": "captures.Synth",
-    "preprocess": "preprocess.Preprocess",
+    "preprocess": "training.Preprocess",
     "train": "training.Train",
     "convert": "training.Convert",
 }
