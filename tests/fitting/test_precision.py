@@ -22,7 +22,7 @@ from humangs_jax.fitting.residuals.keypoints import Observations, frame_residual
 from humangs_jax.fitting.solve import solve
 from humangs_jax.fitting.state import Origin, camera_origin, cameras_of, clothing_thickness, segments, zero_state
 from humangs_jax.fitting.triangulation import triangulate_robustly
-from humangs_jax.geometry import camera, quaternion, svd3, transform
+from humangs_jax.geometry import camera, quaternion, transform
 from humangs_jax.network import vertex_decoder
 from humangs_jax.network.parts import Shells, VertexFeatures
 from humangs_jax.network.pixel_aligned import project_vertices
@@ -132,7 +132,7 @@ PROGRAMS = {
     "transform": lambda: precisions(
         lambda a, p: transform.apply(transform.invert_rigid(a), p), jnp.eye(4), jnp.ones((5, 3))
     ),
-    "svd": lambda: precisions(svd3.left_singular_vectors, jnp.ones((2, 3, 3))),
+    "svd": lambda: precisions(quaternion.left_singular_vectors, jnp.ones((2, 3, 3))),
     "slerp": lambda: precisions(quaternion.interpolate, jnp.ones((2, 3)), jnp.ones((2, 3)), jnp.ones(2)),
     "skinning": lambda: precisions(skinning.blend_transforms, jnp.ones((3, J)), jnp.ones((J, 4, 4))),
     "body": lambda: precisions(posed, jnp.ones(1), POSE.rotations, POSE.translation),
