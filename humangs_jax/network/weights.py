@@ -2,7 +2,7 @@
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
 "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. float16 halves
-the file (and iterations to 11 bits); loading gives float32.
+the file (and rounds to 11 bits); loading gives float32.
 """
 
 import os
