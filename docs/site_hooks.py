@@ -1,0 +1,31 @@
+"""What mkdocs does with our pages: help texts of the commands, and links to files that are not on the site."""
+
+import os
+import re
+import subprocess
+import sys
+
+COMMANDS = "<!-- commands -->"
+"""Where docs/cli.md gets the help of every command."""
+OUTSIDE = re.compile(r"\[([^\]]*)\]\((?:\.\./)+(?!images/|api/)([^)\s]+)\)")
+"""A link that leaves docs/: right on a checkout, and nothing on the site."""
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Called by mkdocs for the text of every page."""
+    if COMMANDS in markdown:
+        markdown = markdown.replace(COMMANDS, commands())
+    return OUTSIDE.sub(lambda link: link[1] if f"`{link[2]}`" == link[1] else f"{link[1]} (`{link[2]}`)", markdown)
+
+
+def commands() -> str:
+    """The help texts of all commands as one Markdown text."""
+    names = re.findall(r"\{([a-z,]+)\}", help_of())[0].split(",")
+    return "\n\n".join(f"## humangs {name}\n\n```text\n{help_of(name)}\n```" for name in names)
+
+
+def help_of(*command: str) -> str:
+    """What `humangs COMMAND --help` prints, without colors."""
+    run = [sys.executable, "-m", "humangs_jax.cli", *command, "--help"]
+    environment = os.environ | {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "120"}
+    return subprocess.run(run, capture_output=True, text=True, check=True, env=environment).stdout.strip()
