@@ -24,7 +24,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
-from humangs_jax.data.motion.loading import load_motion
+from humangs_jax.data.motion.motion import load_motion
 from humangs_jax.detection.blazepose import Networks
 from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
 from humangs_jax.fitting.refine_iterations import posed_vertices

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from humangs_jax.avatar.export import VIDEOS, VideoFormat
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.registry import alternatives
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import to_uint8, write_png
 
@@ -23,28 +25,27 @@ VP9_QUALITY = 18
 """libvpx's constant quality, 0 to 63: its 18 is about as good as x264's."""
 LARGEST_GIF = 1 << 30
 """Bytes of all frames of a GIF in 24 bits, which are kept in memory: one palette is chosen for all."""
-SUFFIXES = (".mp4", ".webm", ".gif")
 LARGEST_GIF_FPS = 50
 """Viewers slow down frames that are shorter than 2/100 s."""
 PALETTE_FRAMES = 16
 """The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
-def check_video(path: str | Path, frames: int, width: int, height: int, transparent: bool = False) -> None:
-    """Check that such a video can be written; call it before its frames are drawn.
+def check_video(path: str | Path, frames: int, width: int, height: int, transparent: bool = False) -> VideoFormat:
+    """Check that such a video can be written; call it before its frames are drawn. Returns its format.
 
     Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency that the
     format does not have, or a GIF that would not fit into memory, or something else of that name.
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in (*SUFFIXES, ""):
+    form = next((each for each in VIDEOS.values() if suffix in each.suffixes), None)
+    if form is None:
+        raise ArgumentError("path", f"{path}: expected a name ending in {alternatives(VIDEOS.suffixes)} for PNG files")
+    if transparent and not form.transparent:
+        others = alternatives(VIDEOS.where(lambda each: each.transparent).suffixes)
         raise ArgumentError(
-            "path", f"{path}: expected a name ending in {', '.join(SUFFIXES)}, or a folder for PNG files"
-        )
-    if transparent and suffix in (".mp4", ".gif"):
-        raise ArgumentError(
-            "path", f"{path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a color"
+            "path", f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color"
         )
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
         raise ArgumentError(
@@ -54,6 +55,7 @@ def check_video(path: str | Path, frames: int, width: int, height: int, transpar
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
     if not suffix and path.is_file():
         raise ArgumentError("path", f"{path}: is a file: expected a folder name")
+    return form
 
 
 @checked_arguments
@@ -79,19 +81,19 @@ def write_video(
     if first is None:
         raise ValueError(f"{path}: expected at least one frame, got none")
     height, width, channels = first.shape
-    check_video(path, 0, width, height, channels == 4)
+    form = check_video(path, 0, width, height, channels == 4)
     count = itertools.count()  # of the frames that have been taken
     frames = (frame for frame, _ in zip(itertools.chain([first], checked), count, strict=False))
-    writers = {".mp4": _write_mp4, ".webm": _write_webm, ".gif": _write_gif}
     if path.suffix:
-        replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps), first.shape))
+        replace_file(path, lambda temporary: form(temporary, frames, float(fps), first.shape))
     else:
         old = [file.name for file in path.glob("frame_*.png")]
-        add_files(path, lambda folder: _write_pngs(folder, frames), without=old)
+        add_files(path, lambda folder: form(folder, frames, float(fps), first.shape), without=old)
     return next(count)
 
 
-def _write_pngs(folder, frames):
+def write_images(folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+    """PNG files of all frames."""
     for i, frame in enumerate(frames):
         write_png(folder / f"frame_{i:05d}.png", frame)
 
@@ -109,12 +111,14 @@ def _checked(path, frames):
         yield frame
 
 
-def _write_mp4(path, frames, fps, shape):
+def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+    """H.264."""
     quality = ["-c:v", "libx264", "-crf", str(CONSTANT_RATE_FACTOR), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     _write_by_ffmpeg(path, frames, fps, shape, quality)
 
 
-def _write_webm(path, frames, fps, shape):
+def write_webm(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+    """VP9."""
     quality = ["-c:v", "libvpx-vp9", "-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "4"]
     quality += ["-fflags", "+bitexact"]  # no random number in the file
     if shape[-1] == 4:  # a second stream beside the colors; alternate reference frames would separate the two
@@ -177,7 +181,8 @@ def _commonest(pixels):
     return common >> 16, common >> 8 & 255, common & 255
 
 
-def _write_gif(path, frames, fps, _):
+def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
+    """One palette for all frames."""
     from PIL import Image
 
     step = int(np.ceil(fps / LARGEST_GIF_FPS))

@@ -3,10 +3,11 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from humangs_jax.avatar.export import VIDEOS
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import (
     Preset,
@@ -19,29 +20,26 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.core.registry import FOLDER, alternatives
+from humangs_jax.data.formats import MOTIONS
 
 TURN_SECONDS = 4.0
 """A turntable as a video turns once in this time."""
 SLOWEST, FASTEST = 0.01, 1000.0
 """Frames per second."""
-SUFFIXES = (".mp4", ".webm", ".gif")
+_SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Animate:
-    """Animate an avatar with a motion of SMPL-X poses and write a video: .mp4, .webm (may be transparent), .gif, or a folder of
-    PNG files. The camera goes along with the person.
-    """
+    """Animate an avatar with a motion and write a video, or a folder of PNG files. The camera goes along with the person."""
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
-    motion: Path | None = None
-    """.npz or .pkl (ours, AMASS, AIST++, THuman4.0, AvatarReX, SMPL), LHM's .json, or a skeleton's .bvh or .glb. Default: the
-    shipped walk."""
-    out: Path = Path("animation.mp4")
-    """The video to write; a name without suffix is a folder for frame_00000.png and so on."""
+    motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = None
+    out: Annotated[Path, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
     turn: float = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
     follow: bool = True
@@ -96,8 +94,9 @@ class Render:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot]
-    out: Path = Path("views")
-    """Folder for view_000.png and so on, or a video of a turn: .mp4, .webm or .gif."""
+    out: Annotated[Path, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = Path(
+        "views"
+    )
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
     views: int | None = None
@@ -220,7 +219,7 @@ class View:
 def _require_place(out):
     """A video, or a folder of PNG files. Raises: UsageError."""
     if out.suffix:
-        require_suffix(out, SUFFIXES)
+        require_suffix(out, VIDEOS.suffixes)
         require_parent(out)
     else:
         require_folder(out)

@@ -25,6 +25,8 @@ class Format:
     """The function that reads or writes them; as text "package.module:function"."""
     suffixes: tuple[str, ...] = ()
     """Of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not tell."""
+    recognizes: str | Callable[[Path], bool] | None = None
+    """Whether a file with such a suffix is of this format, where suffixes are shared; None: it is."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """What the code makes of the arguments."""
@@ -47,6 +49,11 @@ class Formats(dict[str, F]):
         suffix = FOLDER if path.is_dir() else path.suffix.lower()
         return self.where(lambda each: suffix in each.suffixes)
 
+    def recognized(self, path: Path) -> F | None:
+        """The first of them that the file is, None for none; those that look into it are asked first."""
+        found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
+        return next((each for each in found if each.recognizes is None or imported(each.recognizes)(path)), None)
+
     def where(self, holds: Callable[[F], bool]) -> "Formats[F]":
         """Those for which this holds."""
         return Formats({name: each for name, each in self.items() if holds(each)})
@@ -61,7 +68,7 @@ class Formats(dict[str, F]):
 
 def alternatives(suffixes: tuple[str, ...]) -> str:
     """As errors name them: ".bvh, .glb or a folder"."""
-    words = [suffix or "a folder" for suffix in suffixes]
+    words = [suffix for suffix in suffixes if suffix] + ["a folder"] * (FOLDER in suffixes)
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 

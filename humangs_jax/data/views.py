@@ -17,7 +17,7 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.motion.world import nearest_axis, standing_axis, turned_upright, upright_matrix
+from humangs_jax.data.motion.rules import nearest_axis, standing_axis, turned_upright, upright_matrix
 from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum

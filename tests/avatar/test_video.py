@@ -188,7 +188,7 @@ NAN[1, 2, 2, 0] = np.nan
         ("a.mp4", NAN, 24, "frame 1"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), 0, "frames per second"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), float("inf"), "frames per second"),
-        ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"expected a name ending in \.mp4, \.webm, \.gif, or a folder"),
+        ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"expected a name ending in \.mp4, \.webm, \.gif or a folder"),
         ("a.mp4", np.zeros((2, 4, 4, 4)), 24, r"\.mp4 has no transparency: expected \.webm"),
         ("a.gif", np.zeros((2, 4, 4, 4)), 24, r"\.gif has no transparency"),
         ("frames", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),

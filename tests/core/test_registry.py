@@ -25,5 +25,9 @@ def test_a_row_added_in_one_line_is_listed_and_called(monkeypatch):
     monkeypatch.setitem(TABLE, "mine", Format("my own", lambda path: path.stem, (".mine",)))
     assert TABLE.listed().endswith("; .mine: my own")
     assert [each(Path("walk.mine")) for each in TABLE.of(Path("walk.mine")).values()] == ["walk"]
-    assert alternatives(TABLE.suffixes) == ".npz, .pkl, .json, a folder or .mine"
+    first = Format("an older version", len, (".mine",), recognizes=lambda path: path.stem == "old")
+    table = Formats(**TABLE, first=first)
+    assert table.recognized(Path("old.mine")) is first and table.recognized(Path("new.mine")) is TABLE["mine"]
+    assert table.recognized(Path("a.other")) is None
+    assert alternatives(TABLE.suffixes) == ".npz, .pkl, .json, .mine or a folder"
     assert Formats(a=Format("A", len), b=Format("B", len)).listed() == "a: A; b: B"

@@ -1,3 +1,4 @@
+import importlib
 import json
 import pickle
 
@@ -5,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_line import run
 from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
@@ -12,7 +14,11 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.body.smplx import HandBasis
+from humangs_jax.cli import animate
+from humangs_jax.core.registry import imported
+from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.data.motion import PELVIS, UPRIGHT, Motion, MotionError, grounded, load_motion, save_motion
+from humangs_jax.data.motion.motion import Poses
 from humangs_jax.geometry import quaternion
 
 FLOAT32 = 1e-5
@@ -188,6 +194,28 @@ def test_lhm(tmp_path):
         np.testing.assert_allclose(motion.rotations[i], np.concatenate(parts), atol=FLOAT32)
     one = load_motion(tmp_path / "seq" / "10.json")
     np.testing.assert_array_equal(one.rotations, motion.rotations[2:3])
+
+
+def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
+    """Known to the command's help and to `load_motion`, which finds the one of two formats that a file is by its content."""
+    standing = lambda path, reading: Poses(np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text()))
+    monkeypatch.setitem(
+        MOTIONS, "toy", MotionFormat("made up", standing, (".toy", ".pkl"), lambda path: path.suffix == ".toy")
+    )
+    monkeypatch.setattr(animate, "Animate", animate.Animate)  # reloading replaces it
+    importlib.reload(animate)
+    assert ".toy or .pkl: made up" in " ".join(
+        run(monkeypatch, capsys, "animate", "--help")[1].replace("│", " ").split()
+    )
+    (tmp_path / "a.toy").write_text("25")
+    assert load_motion(tmp_path / "a.toy").fps == 25.0
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(AIST))
+    assert load_motion(tmp_path / "a.pkl").fps == 60.0
+
+
+@pytest.mark.parametrize("each", MOTIONS.values(), ids=MOTIONS)
+def test_every_row_names_code_that_is_there(each):
+    assert callable(imported(each.code)) and each.suffixes
 
 
 # The world's up ------------------------------------------------------------------------------------------------------

@@ -272,7 +272,9 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
     with pytest.raises(MotionError, match="expected metres, at most 10000 from the origin, got 1e\\+06"):
         load_motion(tmp_path / "far.npz")
     (tmp_path / "walk.fbx").write_text("Kaydara")
-    with pytest.raises(MotionError, match=r"expected a file .npz, .pkl, .json, .bvh or .glb, got .fbx"):
+    with pytest.raises(
+        MotionError, match=r"expected a file .npz, .pkl, .pickle, .json, .bvh, .glb or a folder, got .fbx"
+    ):
         load_motion(tmp_path / "walk.fbx")
 
 

@@ -1,4 +1,4 @@
-"""An avatar in the files that other people's programs open (docs/export.md): the table of their formats.
+"""An avatar in the files that other people's programs open (docs/export.md), and videos of it: the tables of their formats.
 
 `files.export` writes a file, `gaussians` and `mesh` hold what each format is made of.
 """
@@ -6,7 +6,7 @@
 import dataclasses
 from typing import Literal
 
-from humangs_jax.core.registry import Format, Formats
+from humangs_jax.core.registry import FOLDER, Format, Formats
 
 Up = Literal["y", "-y", "z"]
 """The axis that points up in a file."""
@@ -39,6 +39,23 @@ EXPORTS = Formats(
     obj=ExportFormat("the body as a textured mesh in a pose", f"{HERE}.mesh:write_poses", (".obj",), mesh=True),
 )
 """By name; a suffix has at most one format of Gaussians and one of meshes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoFormat(Format):
+    """One format. code: called as code(path, frames, fps, shape of a frame)."""
+
+    transparent: bool = False
+    """Its frames may have alpha."""
+
+
+_VIDEO = "humangs_jax.avatar.video"
+VIDEOS = Formats(
+    mp4=VideoFormat("H.264, plays everywhere", f"{_VIDEO}:write_mp4", (".mp4",)),
+    webm=VideoFormat("VP9, may be transparent", f"{_VIDEO}:write_webm", (".webm",), transparent=True),
+    gif=VideoFormat("256 colors, endless", f"{_VIDEO}:write_gif", (".gif",)),
+    images=VideoFormat("frame_00000.png and so on", f"{_VIDEO}:write_images", (FOLDER,), transparent=True),
+)
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:

@@ -1,17 +1,4 @@
-"""Motions in files of arrays: the keys decide the format.
-
-=================  =====================================================================  =======================
-format             keys                                                                   frames per second
-=================  =====================================================================  =======================
-ours (.npz)        rotations (m, j, 3), translations (m, 3)                               fps
-AMASS and other    poses, fullpose or pose (m, 165 | 156 | 72 | 66), or (m, joints, 3);   mocap_framerate, fps
-SMPL (.npz, .pkl)  trans or transl (m, 3)
-AIST++ (.pkl|npz)  smpl_poses (m, 72), smpl_trans (m, 3); smpl_scaling (1,) or millimetres  60
-THuman4.0,         global_orient (m, 3), body_pose (m, 63 | 69), transl (m, 3), and if    fps, else 30
-AvatarReX (.npz)   there are any jaw_pose, leye_pose, reye_pose (m, 3), *_hand_pose (m, 45)
-LHM (.json, or a   root_pose (3,), body_pose (21, 3), trans (3,), and if there are any    30
-folder of them)    jaw_pose, leye_pose, reye_pose (3,), lhand_pose, rhand_pose (15, 3)
-=================  =====================================================================  =======================
+"""Motions in files of arrays: the keys decide the format (`data.formats`), one function for each kind of keys.
 
 SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole hands; 22 (66) are the body.
 What a file does not have (fingers, eyes) is 0.
@@ -24,22 +11,22 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion.motion import MotionError
-from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, FORMATS, HAND_NUMBERS, MILLIMETRES
+from humangs_jax.data.formats import MOTIONS
+from humangs_jax.data.motion.motion import MotionError, Poses, Reading
+from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, HAND_NUMBERS, MILLIMETRES
 from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.reading import open_file, read_json
+from humangs_jax.io.reading import read_json
 
 
-def read_arrays(path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
-    """Rotations (m, 55, 3), translations (m, 3), frames per second, and the format (`rules.Format`). Raises: MotionError."""
-    file = _MotionFile(path, hands, flat_hand_mean, fps)
-    for form in FORMATS:
+def read_arrays(path: Path, options: Reading) -> Poses:
+    """The poses of a file. Raises: MotionError, naming the key."""
+    file, known = _MotionFile(path, options), [each.arrays for each in MOTIONS.values() if each.arrays is not None]
+    for form in known:
         if all(key in file.values for key in form.keys):
             rotations, translations = _READERS[form.kind](file, form)
-            return rotations, translations, file.rate(form.rates, form.fps), form
-    expected = ", ".join(dict.fromkeys(form.keys[0] for form in FORMATS))
+            return Poses(rotations, translations, file.rate(form.rates, form.fps), form.up, form.fixed, form.also)
+    expected = ", ".join(dict.fromkeys(form.keys[0] for form in known))
     keys = ", ".join(sorted(file.values)) or "none"
     raise MotionError(path, "", f"no motion: expected one of the keys {expected}, got {keys}")
 
@@ -112,12 +99,11 @@ _READERS = {"ours": _ours, "whole": _whole, "scaled": _scaled, "parts": _parts}
 class _MotionFile(ArrayFile):
     """The values of a motion file, and how its hands are written."""
 
-    def __init__(self, path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
-        self.hands, self.flat_hand_mean, self.fps = hands, flat_hand_mean, fps
+    def __init__(self, path: Path, options: Reading):
+        self.hands, self.flat_hand_mean, self.fps = options
         if path.is_dir() or path.suffix.lower() == ".json":
             super().__init__(path, _read_json_frames(path), error=MotionError)
         else:
-            _check_suffix(path)
             file = ArrayFile.open(path, MotionError)
             super().__init__(path, file.values, file.pickled, MotionError)
 
@@ -170,16 +156,6 @@ class _MotionFile(ArrayFile):
         face = [zeros(3) if part is None else part for part in face or [None] * 3]
         hands = [zeros(HAND_NUMBERS) if hand is None else hand for hand in hands or [None] * 2]
         return np.concatenate([body, *face, *hands], axis=1).reshape(len(body), -1, 3)
-
-
-def _check_suffix(path):
-    """Raises: MotionError for a file of another name that is no npz archive either."""
-    if path.suffix.lower() in (".npz", ".pkl", ".pickle"):
-        return
-    with open_file(path) as file:
-        if file.read(2) != b"PK":
-            found = path.suffix or "no suffix"
-            raise MotionError(path, "", f"no motion: expected a file .npz, .pkl, .json, .bvh or .glb, got {found}")
 
 
 def _read_json_frames(path):

@@ -19,7 +19,7 @@ _WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")
 _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 
 
-def read_bvh(path: Path) -> Clip:
+def read_bvh(path: Path, options: object = None) -> Clip:
     """The skeleton of a file in motion. Raises: OSError; Refused or FileError, which say what was expected."""
     text = read_text(path)
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from humangs_jax.data.motion.rules import DEFAULT_FPS
+from humangs_jax.data.formats import DEFAULT_FPS
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
@@ -18,7 +18,7 @@ from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_by
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 
-def read_animation(path: Path) -> Clip:
+def read_animation(path: Path, options: object = None) -> Clip:
     """The skeleton of a GLB file in motion. Raises: OSError; Refused and what damaged numbers raise."""
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")

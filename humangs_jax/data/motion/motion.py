@@ -1,7 +1,11 @@
-"""A motion in memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up."""
+"""A motion in memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. `load_motion` is the one door to files."""
 
 import functools
+import logging
+from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +13,22 @@ import numpy as np
 
 from humangs_jax.body import skinning
 from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
-from humangs_jax.data.motion.rules import DEFAULT_FPS
+from humangs_jax.core.registry import alternatives
+from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
+from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, MotionFormat
+from humangs_jax.data.motion import rules, skeleton
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.npz import write_npz
-from humangs_jax.io.reading import FileError, check_limit
+from humangs_jax.io.reading import FileError, check_limit, open_file, reading
+
+logger = logging.getLogger(__name__)
+WALK = "walk.npz"
+SLOWEST = 0.01
+"""Frames per second: one in more than a minute and a half is no motion."""
 
 
 class MotionError(FileError):
@@ -59,6 +73,127 @@ def _between(rotations, translations, next_rotations, next_translations, share):
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)
     return jnp.where(share[:, None, None] > 0, turned, rotations), moved
+
+
+class Reading(NamedTuple):
+    """What `load_motion` was asked, as readers need it; see there."""
+
+    hands: HandBasis | None = None
+    flat_hand_mean: bool = True
+    fps: float | None = None
+
+
+class Poses(NamedTuple):
+    """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the file, of which `up` is up.
+
+    fixed: whatever the poses look like; also: other axes that are up in some files of the format, see `rules.up_axis`.
+    """
+
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+    fps: float
+    up: str = "y"
+    fixed: bool = False
+    also: tuple[str, ...] = ()
+
+
+@checked_arguments
+def load_motion(
+    path: str | Path | None = None,
+    *,
+    up: str = "auto",
+    fps: float | int | None = None,
+    hands: HandBasis | None = None,
+    flat_hand_mean: bool = True,
+    rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
+) -> Motion:
+    """Read a motion; suffix and content decide the format (docs/motions.md).
+
+    Arguments:
+        path: None for the walk that comes with the package; else a file or a folder of one of `data.formats.MOTIONS`.
+        up: axis of the file's world that points up ("y", "-y", "z", ...); the motion is turned so that y does. "auto" is
+            the format's own: AMASS z, others y; of .bvh the up of the rest pose if a person stands in it, else y. It is
+            another only where people stand along that and its floor carries them (`rules.up_axis`), which is logged as a
+            warning, and never in our own format, AIST++ and .glb.
+        fps: frames per second in place of those in the file.
+        hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
+            `flat_hand_mean` False, which adds the mean hand (only to hands that a file has). Our own format holds
+            whole rotations: there is nothing to add.
+        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other programs
+            are brought to it, and a motion of another number of joints is refused. None: the shipped body.
+
+    Raises: MotionError, one line naming file and key.
+    """
+    if up not in ("auto", *rules.UPRIGHT):
+        raise ValueError(f"up: expected auto, {', '.join(rules.UPRIGHT)}, got {up!r}")
+    if hands is None and not flat_hand_mean:
+        raise ValueError("flat_hand_mean=False needs the mean hand: pass hands")
+    if path is None:
+        with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
+            return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
+    with reading(path, "motion", MotionError):
+        options = Reading(hands, flat_hand_mean, None if fps is None else float(fps))
+        return _load(Path(path), up, options, rest_joints)
+
+
+def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
+    read = _reader(path)
+    body = lambda: skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+    with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
+        found = read(path, options)
+        if isinstance(found, skeleton.Clip):
+            rate = skeleton.whole_rate(found.fps)
+            rotations, translations, said = skeleton.retargeted(found, body(), up)
+        else:
+            rate = found.fps
+            axis, said = _up_of(found, body) if up == "auto" else (up, "")
+            rotations, translations = rules.turned_upright(found.rotations, found.translations, axis)
+    if rest_joints is not None and rotations.shape[1] != len(rest_joints):
+        raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
+    with np.errstate(over="ignore"):  # what is no float32 is infinite from here on
+        rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
+    if not np.isfinite(rotations).all():
+        raise MotionError(path, "", "expected rotations and a skeleton of finite size")
+    if (largest := np.abs(rotations).max()) > LARGEST_TURN:
+        raise MotionError(path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}")
+    if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
+        limit = f"at most {LARGEST_DISTANCE:g} from the origin"
+        raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
+    check_limit("frames", len(rotations), "frames")
+    rate = rate if options.fps is None else options.fps
+    check_limit("rate", rate, "frames per second")
+    if rate < SLOWEST:
+        raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
+    if said:
+        logger.warning("%s: %s", path, said)
+    return Motion(jnp.asarray(rotations), jnp.asarray(translations), rate)
+
+
+def _reader(path: Path) -> MotionFormat:
+    """The format of a file, of its suffix or, of archives of arrays, of its content. Raises: MotionError."""
+    if not path.exists():
+        raise MotionError(path, "", "no such file")
+    found = MOTIONS.recognized(path)
+    if found is None and path.is_file() and not MOTIONS.of(path):
+        with open_file(path) as file:
+            found = MOTIONS["humangs"] if file.read(2) == b"PK" else None
+    if found is None:
+        got = path.suffix or "no suffix"
+        raise MotionError(path, "", f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}")
+    return found
+
+
+def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
+    """The axis that is up, and what is to be said about it."""
+    rotations, translations, usual = poses.rotations, poses.translations, poses.up
+    stands = None if poses.fixed else rules.standing_axis(rotations[:, 0])
+    if stands in (None, usual) or len(joints := body()) != rotations.shape[1]:  # another number is refused later
+        return usual, ""
+    chosen = rules.sampled_frames(len(rotations))
+    points = rules.joint_places(joints, rotations[chosen], translations[chosen])
+    return rules.up_axis(points, stands, usual, poses.fps, poses.also)
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:

@@ -45,8 +45,11 @@ from humangs_jax.data.motion.rules import (
     SIDES,
     STANDING,
     TOPS,
+    nearest_axis,
+    sampled_frames,
+    up_axis,
+    upright_matrix,
 )
-from humangs_jax.data.motion.world import nearest_axis, sampled_frames, up_axis, upright_matrix
 from humangs_jax.io.reading import Refused
 
 
