@@ -1,4 +1,4 @@
-"""Tables of README.md and docs/*.md from docs/results/*.json.
+"""Tables of README.md and docs/ from docs/results/*.json.
 
     python experiments/render_tables.py [--check]
 
@@ -29,7 +29,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
     """Renders README.md and docs/*.md; returns what is wrong, one line each."""
     results, faults, shown = repository / "docs" / "results", [], set()
     known = {path.stem for path in results.glob("*.json")}
-    for page in [repository / "README.md", *sorted((repository / "docs").glob("*.md"))]:
+    for page in [repository / "README.md", *sorted((repository / "docs").rglob("*.md"))]:
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
         faults += [f"{page.name}: no docs/results/{name}.json for its table" for name in names if name not in known]

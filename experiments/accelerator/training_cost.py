@@ -33,7 +33,7 @@ VARIANTS = {
 }
 """What the backward pass finds of the blocks, and which patches become tokens."""
 FOREGROUND_SHARE = 0.22
-"""Room for foreground tokens: a person by the published protocol touches a fifth (docs/performance_reconstruction.md)."""
+"""Room for foreground tokens: a person by the published protocol touches a fifth (docs/performance.md)."""
 XLA_TOKENS = 8192
 
 

@@ -122,7 +122,7 @@ def publish(page: Path, name: str, text: str, numbers: object = None, row: str |
     Raises: FileNotFoundError; ValueError if the page lacks the section.
     """
     check_section(page, name)
-    folder = page.parent / "docs" if page.name == "README.md" else page.parent
+    folder = next((f for f in page.resolve().parents if f.name == "docs"), page.parent / "docs")
     path, blocks = folder / "results" / f"{name}.json", blocks_of(text)
     record = run_record()
     if row is not None and path.exists():

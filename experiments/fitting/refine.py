@@ -1,6 +1,6 @@
 """How much refinement mends cameras and poses that are a little off, on synthetic people of the fitting seeds.
 
-    python experiments/fitting/refine.py --subjects 4 --views 6 --json refine.json [--page docs/fitting_refinement.md]
+    python experiments/fitting/refine.py --subjects 4 --views 6 --json refine.json [--page docs/fitting.md]
 
 The start: all focal lengths off by 5 %, every camera turned by 2 degrees about a random axis through its centre, every joint
 (the root and the fingers, too) by 3 degrees about a random axis; true shape. --exact starts at the truth instead, which should

@@ -13,7 +13,7 @@ Writes {"all", "foreground": {"ms", "cpu_ms", "compile_s", "tokens", "flops", "t
 "ratio_to_published_matmul", "matmul_gflops", "foreground_share", "speed_up": {"promised", "measured", "fraction"},
 "memory": {"all", "foreground": {views: {"temporary_mb", "flops"}}}, ...}.
 
-Published at 256 with 4 views takes 3 minutes on 2 cores. Numbers: docs/performance_reconstruction.md.
+Published at 256 with 4 views takes 3 minutes on 2 cores. Numbers: docs/performance.md.
 """
 
 import argparse

@@ -8,7 +8,7 @@ the first row (relative L2 of offsets from the vertices, and of colors) and of a
 random weights (the default) the rows that are exact by construction must show rounding only; what foreground tokens do
 to a network that was trained with all of them, only `--weights` of such a network tell.
 
-Published sizes at 256 take 2 minutes on 2 cores. Numbers: docs/performance_reconstruction.md.
+Published sizes at 256 take 2 minutes on 2 cores. Numbers: docs/performance.md.
 """
 
 import argparse

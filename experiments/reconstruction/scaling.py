@@ -7,7 +7,7 @@ all tokens and with those of the foreground; and, counted from compiled programs
 published network itself. CPU time is that of all threads.
 
 5 minutes on 2 cores. Expected: attention makes all tokens grow faster than the views from 4 of them on; foreground
-tokens grow with them. Numbers: docs/performance_reconstruction.md.
+tokens grow with them. Numbers: docs/performance.md.
 """
 
 import argparse

@@ -1,14 +1,14 @@
 """Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
 
     python experiments/training/benchmark.py --json OUT                       # all cases: half an hour on 2 idle cores
-    python experiments/training/benchmark.py --json OUT --page docs/performance_training.md
+    python experiments/training/benchmark.py --json OUT --page docs/performance.md
 
 A synthetic person is made and read by the loader; all weights are random, also those of loss networks: they cost what trained
 ones cost. Operations are counted from the traced step, loops included (`common/costs.py`). The floor is
 the time that these operations take as plain products in the same turns. Results are added to OUT, so cases can be run one by
 one; `--page` writes them into a page and runs nothing.
 
-Numbers: docs/performance_training.md.
+Numbers: docs/performance.md.
 """
 
 import argparse

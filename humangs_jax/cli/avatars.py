@@ -86,7 +86,7 @@ class Reconstruct:
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
     """The patches of the photos that the network reads: all, or those that show the person, which is several times
-    faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
+    faster. For weights trained with the other setting it is an approximation (docs/performance.md)."""
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None

@@ -116,7 +116,7 @@ class PatchTransformer:
         UpsamplerConfig(),
         cost="vertices read maps of one feature vector per patch",
         gain="440 GFLOP of the published network at 512",
-        measured="performance_reconstruction.md",
+        measured="performance.md",
     )
 
     def __post_init__(self):

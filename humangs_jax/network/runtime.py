@@ -9,7 +9,7 @@ from humangs_jax.core.configuration import Chunk, Edge, InputSide, Length, Prese
 from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
-MEASURED, TRADE, EVALUATION = "performance_reconstruction.md", "tradeoff.md", "evaluation.md"
+MEASURED, TRADE, EVALUATION = "performance.md", "tradeoff.md", "evaluation.md"
 
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]

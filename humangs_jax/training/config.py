@@ -110,7 +110,7 @@ class TrainConfig:
     steps: Steps = 20_000
     batch_size: Few = 1
     microbatch_size: Few = knob(
-        1, cost="memory in proportion", gain="fewer, larger steps on accelerators", measured="performance_training.md"
+        1, cost="memory in proportion", gain="fewer, larger steps on accelerators", measured="performance.md"
     )
     stages: tuple[Stage, ...] = ()
     ema_decay: Share | None = None

@@ -38,7 +38,7 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
         "savings": ("reconstruction/savings", "--preset", "tiny", *shared, "--views", 2),
     }
     page = tmp_path / "page.md"
-    page.write_text((REPOSITORY / "docs" / "performance_reconstruction.md").read_text())
+    page.write_text((REPOSITORY / "docs" / "performance.md").read_text())
     for name, (script, *arguments) in options.items():
         size = ("--memory-size", 64) if name == "benchmark" else ()
         out = ("--json", tmp_path / f"{name}.json", "--page", page)

@@ -27,7 +27,7 @@ def page(tmp_path):
 
 @pytest.mark.slow
 def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path, page):
-    numbers, path = tmp_path / "numbers.json", page("performance_training.md")
+    numbers, path = tmp_path / "numbers.json", page("performance.md")
     command = [sys.executable, str(EXPERIMENTS / "training" / "benchmark.py"), "--json", str(numbers)]
     options = ["--only", "tiny 32", "--repeats", "1"]
     subprocess.run([*command, *options], check=True, cwd=tmp_path)
