@@ -105,8 +105,7 @@ def measure_preprocessing(
     out: Path, sets: dict[str, tuple[Path, Path]], kinds: Sequence[str], views: int
 ) -> dict[str, Any]:
     """Seconds for a view of each kind, one process, compilation apart."""
-    from humangs_jax.data.preprocess.run import preprocess
-    from humangs_jax.data.preprocess.scenes import Settings
+    from humangs_jax.data.preprocess.run import Settings, preprocess
 
     results = {}
     for kind in kinds:
@@ -189,7 +188,7 @@ def main() -> None:
         parser.error("--samples and --views must be at least 1, --flat and --flat-photos at least 50")
     prepare_process()
     from humangs_jax.data.datasets.bodies import FileBody
-    from humangs_jax.data.datasets.opening import open_people
+    from humangs_jax.data.datasets.subject import open_people
 
     result: dict[str, Any] = {"train_step_s": arguments.train_step_s, "preprocessing": {}, "sources": {}}
     if arguments.json and arguments.json.exists():

@@ -4,12 +4,20 @@ import dataclasses
 import os
 import re
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_parent, require_suffix
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.data.formats import DATASETS
+
+RAW = DATASETS.where(lambda each: not each.lists)
+"""Data sets that are preprocessed."""
+if TYPE_CHECKING:
+    Kind = str
+else:
+    Kind = Literal[tuple(RAW)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +45,7 @@ class Preprocess:
     Layouts of data sets, licences, and lines for SLURM: docs/datasets.md.
     """
 
-    kind: Positional[Literal["thuman", "thuman4", "avatarrex"]]
-    """THuman2.0 and 2.1, THuman4.0, or AvatarReX."""
+    kind: Annotated[Positional[Kind], arg(help=RAW.listed())]
     source: Positional[Path]
     """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the folder of several."""
     scans: OmitArgPrefixes[ScanViews]
@@ -74,8 +81,7 @@ class Preprocess:
         require_at_least(1, workers=self.workers)
         require_folder(self.out)
         with stage("starting"):
-            from humangs_jax.data.preprocess.run import preprocess
-            from humangs_jax.data.preprocess.scenes import Settings
+            from humangs_jax.data.preprocess.run import Settings, preprocess
 
         settings = Settings(
             self.kind,

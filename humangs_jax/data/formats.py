@@ -1,6 +1,8 @@
-"""What is read: files of motions. A row each; a new format is a file with its reader and a line here."""
+"""What is read: motions and data sets. A row each; a new format is a file with its reader and a line here."""
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 
 from humangs_jax.core.registry import FOLDER, Format, Formats
 
@@ -89,3 +91,36 @@ MOTIONS = Formats(
     glb=MotionFormat("skeletons of the same names", "humangs_jax.data.motion.gltf:read_animation", (".glb",)),
 )
 """By name, in the order in which keys and files are asked."""
+
+# Data sets --------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class DataSetFormat(Format):
+    """A data set of captured people. code: opens one subject, code(its path, body) -> `subject.Subject`."""
+
+    find: str | Callable[[Path], tuple[Path, ...]] = ""
+    """Paths of the subjects in a folder, sorted, or the folder itself; empty if it has another layout."""
+    lists: bool = False
+    """A file lists many: code(path, body, size) -> tuple of `subject.Person`."""
+    scans: bool = False
+    """Textured scans: there are no photos before `humangs preprocess` has rendered some. code: see `preprocess.run`."""
+
+
+def _data_set(about: str, place: str, **options: bool) -> DataSetFormat:
+    """place: module and ending of its functions."""
+    code, find = (f"humangs_jax.data.datasets.{place.replace(':', f':{do}_')}" for do in ("open", "find"))
+    return DataSetFormat(about, code, find=find, lists=options.get("lists", False), scans=options.get("scans", False))
+
+
+DATASETS: Formats[DataSetFormat] = Formats(
+    {
+        "scenes": _data_set("scene list", "scene_list:scene_list", lists=True),
+        "thuman": _data_set("THuman2.0 and 2.1", "thuman:thuman", scans=True),
+        "thuman4": _data_set("THuman4.0", "multiview:thuman4"),
+        "avatarrex": _data_set("AvatarReX", "multiview:avatarrex"),
+        "actorshq": _data_set("ActorsHQ", "actorshq:actorshq"),
+        "dna-rendering": _data_set("DNA-Rendering", "dna_rendering:dna_rendering"),
+    }
+)
+"""By name, in the order in which a folder is compared with them."""

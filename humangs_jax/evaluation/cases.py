@@ -19,7 +19,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.photos import capture_folder
@@ -86,8 +86,8 @@ def find_people(
     """The people of a source.
 
     Arguments:
-        source: a capture folder or a folder of them; a scene list or a data set of any layout of `datasets.opening`; a capture;
-            cases; or a `Source`, whose examples give inputs and targets.
+        source: a capture folder or a folder of them; a scene list or a data set of `data.formats.DATASETS`; a capture; cases; or
+            a `Source`, whose examples give inputs and targets.
         body: the model that the parameters of data sets and sources belong to, or its file (default: the one that comes with the
             package). Captures name theirs.
         inputs: how many photos are inputs: evenly spaced around the person, of the first view's frame. Default: 4, or all of them

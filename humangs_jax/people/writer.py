@@ -1,6 +1,6 @@
 """Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from seeds.
 
-out/manifest.json                    settings of the set and finished subjects, see `write_manifest`
+out/manifest.json                    settings of the set and finished subjects, see `data.sets`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
@@ -8,9 +8,9 @@ out/SEED/scan/                       where asked for: the first pose as a lit, t
 """
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,16 +18,24 @@ import numpy as np
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import say
 from humangs_jax.data.capture import Capture, save_capture
+from humangs_jax.data.capture_checks import checked_json
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.data.preprocess.run import FORMAT as OF_A_DATA_SET
+from humangs_jax.data.sets import (
+    DATA_SET,
+    MANIFEST,
+    SYNTHETIC,
+    begin_set,
+    finished,
+    made,
+    read_manifest,
+    write_manifest,
+)
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
-from humangs_jax.io.reading import read_json, shown, write_json
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
@@ -42,7 +50,7 @@ POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2,
 """Independent random streams of a seed; stream 0 makes the person."""
 GROUNDED_EVERY = 5
 """Every how many frames the height of a motion above the ground is measured."""
-MANIFEST, FORMAT, VERSION = "manifest.json", "humangs-synthetic", 2
+CAPTURE = "capture.json"
 MANIFEST_EVERY = 30.0
 """Seconds between two updates of the manifest."""
 
@@ -143,7 +151,7 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
             export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
-    replace_folder(folder, write, mark="capture.json")
+    replace_folder(folder, write, mark=CAPTURE)
 
 
 def write_set(
@@ -165,25 +173,26 @@ def write_set(
     Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by another version of the
     generator, or (at the end) some could not be made; OSError if nothing can be written there.
     """
-    out, seeds, settings = Path(out), seeds_of(split, first, subjects), dataclasses.asdict(layout)
+    out, seeds = Path(out), seeds_of(split, first, subjects)
+    made_with = {"generator_version": GENERATOR_VERSION, "split": split, "settings": dataclasses.asdict(layout)}
     check_writable(out)
-    begin_set(out, split, settings)
+    begin_set(out, SYNTHETIC, made_with)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
-    missing = [seed for seed, folder in folders.items() if not (folder / "capture.json").is_file()]
+    due = {seed: (folder, seed, layout) for seed, folder in folders.items() if not (folder / CAPTURE).is_file()}
     failed: dict[int, Exception] = {}
-    written = time.monotonic()
+    listed = time.monotonic()
     try:
-        with progress_bar(total=subjects, initial=subjects - len(missing), desc="people", shown=progress) as bar:
-            for seed, error in _make(missing, folders, layout, body, workers):
+        with progress_bar(total=subjects, initial=subjects - len(due), desc="people", shown=progress) as bar:
+            for seed, error in made(_write, due, workers, functools.partial(_given, body)):
                 if error is not None:
                     failed[seed] = error
                     say(f"seed {seed}: {error}", lines=False)
                 bar.update(1)
-                if time.monotonic() - written > MANIFEST_EVERY:
-                    write_manifest(out, split, settings)
-                    written = time.monotonic()
+                if time.monotonic() - listed > MANIFEST_EVERY:
+                    write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
+                    listed = time.monotonic()
     finally:
-        write_manifest(out, split, settings)
+        write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
     if failed:
         seed, error = next(iter(failed.items()))
         found = f"{len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
@@ -191,30 +200,12 @@ def write_set(
     return list(folders.values())
 
 
-def _make(seeds, folders, layout, body, workers):
-    """Yields (seed, None or the error) as people are finished."""
-    if workers > 1 and len(seeds) > 1:
-        tasks = {seed: (folders[seed], seed, layout) for seed in seeds}
-        yield from in_processes(_work, tasks, workers, _load_body, body)
-    elif seeds:
-        _load_body(body)
-        yield from ((seed, _work(folders[seed], seed, layout)) for seed in seeds)
+def _given(body: BodyModel | None) -> BodyModel:
+    return load_body() if body is None else body
 
 
-_worker: dict[str, BodyModel] = {}
-
-
-def _load_body(body):
-    _worker["body"] = load_body() if body is None else body
-
-
-def _work(folder, seed, layout):
-    """None or the error. An OSError ends everything: the disk may be full."""
-    try:
-        write_person(folder, seed, _worker["body"], layout)
-    except (ValueError, ArithmeticError, IndexError, KeyError) as error:
-        return error
-    return None
+def _write(body: BodyModel, folder: Path, seed: int, layout: Layout) -> None:
+    write_person(folder, seed, body, layout)
 
 
 def _views(stream, place, count, poses, size, mark=""):
@@ -226,51 +217,6 @@ def _views(stream, place, count, poses, size, mark=""):
     return views
 
 
-def read_manifest(folder: str | Path) -> dict[str, Any]:
-    """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
-    file = Path(folder) / MANIFEST
-    content = read_json(file)
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
-    if content.get("version") != VERSION:
-        raise ValueError(f"{file}: version: expected {VERSION}, got {shown(content.get('version'))}")
-    if not isinstance(content.get("settings"), dict):
-        raise ValueError(f"{file}: settings: expected an object, got {shown(content.get('settings'))}")
-    return {"generator_version": None, "split": None} | content
-
-
-def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
-    """Start a set in a folder, or check that the one that is there can be continued.
-
-    Raises: ValueError if it was made by another version of the generator, of another split, or with other settings.
-    """
-    folder = Path(folder)
-    if not (folder / MANIFEST).is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        write_manifest(folder, split, settings)
-        return
-    earlier, file = read_manifest(folder), folder / MANIFEST
-    pairs = {name: (earlier["settings"].get(name), settings.get(name)) for name in {**settings, **earlier["settings"]}}
-    changed = [f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in sorted(pairs.items()) if old != new]
-    version, problem = earlier["generator_version"], ""
-    if version != GENERATOR_VERSION:
-        problem = f"written by version {shown(version)} of the generator, this is version {GENERATOR_VERSION}"
-    elif earlier["split"] != split:
-        problem = f"people of the split {shown(earlier['split'])}, now asked for '{split}'"
-    elif changed:
-        problem = f"written with settings other than asked for now ({', '.join(changed)})"
-    if problem:
-        raise ValueError(f"{file}: {problem}: choose another folder")
-
-
-def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
-    """List the finished subjects; written aside, then renamed, so that it is never half there."""
-    folder = Path(folder)
-    content = {"format": FORMAT, "version": VERSION, "generator_version": GENERATOR_VERSION, "split": split}
-    finished = sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json"))
-    write_json(folder / MANIFEST, content | {"settings": settings, "subjects": finished})
-
-
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
     """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic, only of one split.
 
@@ -280,10 +226,10 @@ def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ..
     root = Path(root)
     folders = find_captures(root)
     if split is not None and (root / MANIFEST).is_file():
-        content = read_json(root / MANIFEST)
-        if isinstance(content, dict) and content.get("format") == OF_A_DATA_SET:
+        content = checked_json(root / MANIFEST)
+        if isinstance(content, dict) and content.get("format") == DATA_SET.format:
             return folders
-        read_manifest(root)
+        read_manifest(root, SYNTHETIC)
         for folder in folders:
             if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:
                 raise ValueError(f"{folder}: a subject of the split '{other}', where '{split}' was expected")

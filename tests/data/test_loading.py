@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 
 from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting
 from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
-from humangs_jax.data.preprocess.run import FORMAT
+from humangs_jax.data.sets import DATA_SET, SYNTHETIC, begin_set
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.on_the_fly import GeneratedSource
-from humangs_jax.people.seeds import SPLITS, TRAIN, split_of, subject_key
-from humangs_jax.people.writer import begin_set, find_people
+from humangs_jax.people.seeds import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
+from humangs_jax.people.writer import find_people
 
 SIZE = 4
 
@@ -250,14 +250,14 @@ def test_people_of_another_split_are_refused(tmp_path):
     (tmp_path / ".0000006.123").mkdir()
     (tmp_path / ".0000006.123" / "capture.json").write_text("{}")  # half written
     assert [f.name for f in find_people(tmp_path)] == ["0000005", "2000003"]  # no manifest: not ours
-    begin_set(tmp_path, "train", {})
+    begin_set(tmp_path, SYNTHETIC, {"generator_version": GENERATOR_VERSION, "split": "train", "settings": {}})
     with pytest.raises(ValueError, match=r"2000003: a subject of the split 'test', where 'train' was expected"):
         find_people(tmp_path)
     assert len(find_people(tmp_path, None)) == 2
     (tmp_path / "manifest.json").write_text(json.dumps({"format": "other"}))
     with pytest.raises(ValueError, match="expected a manifest of"):
         find_people(tmp_path)
-    (tmp_path / "manifest.json").write_text(json.dumps({"format": FORMAT}))
+    (tmp_path / "manifest.json").write_text(json.dumps(DATA_SET._asdict()))
     assert len(find_people(tmp_path)) == 2  # of a data set: scans have numbers for names, too
 
 

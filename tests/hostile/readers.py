@@ -33,8 +33,8 @@ from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.datasets.opening import open_people
 from humangs_jax.data.datasets.scene_list import read_evaluation
+from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
@@ -42,8 +42,8 @@ from humangs_jax.data.loading.captures import read_boundary
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
-from humangs_jax.data.preprocess.run import preprocess
-from humangs_jax.data.preprocess.scenes import Settings, scan_content
+from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
+from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.fitting.scan_views import read_placement
@@ -58,7 +58,6 @@ from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.people.bank import load_bank
 from humangs_jax.people.seeds import GENERATOR_VERSION
-from humangs_jax.people.writer import begin_set, read_manifest
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 
@@ -142,8 +141,7 @@ def continue_preprocessing(folder):
 
 def continue_synthetic_set(path):
     """What `synth` does before it makes anybody."""
-    read_manifest(path.parent)
-    begin_set(path.parent, "train", {})
+    begin_set(path.parent, SYNTHETIC, {key: MANIFEST[key] for key in ("generator_version", "split", "settings")})
 
 
 def film(path):

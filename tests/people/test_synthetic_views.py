@@ -125,10 +125,12 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     assert manifest["subjects"] == [f"{seed:07d}" for seed in DEMO[:4]]
     with pytest.raises(ValueError, match=r"image_size 32 -> 64\): choose another folder"):
         write(4, layout=writer.Layout(64, views=2))
-    with pytest.raises(ValueError, match="of the split 'demo', now asked for 'train'"):
+    with pytest.raises(ValueError, match="split 'demo' -> 'train'"):
         write(4, split="train")
     monkeypatch.setattr("humangs_jax.people.writer.GENERATOR_VERSION", seeds.GENERATOR_VERSION + 1)
-    with pytest.raises(ValueError, match=f"version {seeds.GENERATOR_VERSION} of the generator, this is version"):
+    with pytest.raises(
+        ValueError, match=f"generator_version {seeds.GENERATOR_VERSION} -> {seeds.GENERATOR_VERSION + 1}"
+    ):
         write(4)
 
 

@@ -18,16 +18,9 @@ import numpy as np
 
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, pose_matrix
 from humangs_jax.data.capture_checks import CaptureError, checked_text
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.multiview import (
-    PARAMETERS,
-    Folders,
-    checked_cameras,
-    read_parameters,
-    video_subject,
-)
+from humangs_jax.data.datasets.bodies import FileBody, checked_numbers
+from humangs_jax.data.datasets.multiview import PARAMETERS, checked_cameras, folder_subject, read_parameters, subfolders
 from humangs_jax.data.datasets.subject import Subject
-from humangs_jax.data.datasets.values import checked_numbers
 from humangs_jax.io.reading import limits, reading
 
 CALIBRATION, SCALES = "calibration.csv", ("4x", "2x", "1x")
@@ -36,11 +29,7 @@ COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
     """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty if there are none."""
-    is_one = lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES)
-    folder = Path(folder)
-    if is_one(folder):
-        return (folder,)
-    return tuple(sorted(path for pattern in ("*/", "*/*/") for path in folder.glob(pattern) if is_one(path)))
+    return subfolders(folder, lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES), depth=2)
 
 
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
@@ -51,17 +40,10 @@ def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
     cameras = read_csv_cameras(folder / scale / CALIBRATION)
-    part = lambda name, kind: re.compile(re.escape(name) + f"_{kind}" + r"(\d+)")
-
-    def frame_of(name: str):
-        patterns = part(name, "rgb"), part(name, "mask")
-        return lambda stem: next((int(found[1]) for p in patterns if (found := p.fullmatch(stem))), None)
-
-    folders = {
-        c.name: Folders(folder / scale / "rgbs" / c.name, folder / scale / "masks" / c.name, frame_of(c.name))
-        for c in cameras
-    }
-    return video_subject(folder, cameras, folders, read_parameters(folder / PARAMETERS, body))
+    places = [(folder / scale / "rgbs" / camera.name, folder / scale / "masks" / camera.name) for camera in cameras]
+    named = re.compile(r"[\w-]+_(?:rgb|mask)(\d+)")
+    frame_of = lambda stem: int(found[1]) if (found := named.fullmatch(stem)) else None
+    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body), frame_of=frame_of)
 
 
 def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:

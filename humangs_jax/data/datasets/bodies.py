@@ -1,4 +1,7 @@
-"""The body in a data set: its model file, parameters, what a pose makes of it, and parameters from published arrays."""
+"""The body in a data set: its model file, parameters, what a pose makes of it, and parameters from published arrays.
+
+Values of files are checked one by one (`open_arrays`, `checked_numbers`): a fault is a `CaptureError` that names file and key.
+"""
 
 import dataclasses
 import functools
@@ -16,6 +19,17 @@ from humangs_jax.body.smplx import HandBasis, load_hands
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.io import arrays as array_files
+
+LARGEST_ANGLE = 4 * np.pi
+"""Radians of a rotation vector; fits wander beyond 2 pi now and then, degrees are far above."""
+FARTHEST = 100.0
+"""Metres of a translation or of a camera from the origin; millimetres are far above."""
+LARGEST_COEFFICIENT = 30.0
+"""Of shape and expression: standard deviations, usually below 5."""
+
+open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
+checked_numbers = functools.partial(array_files.checked_numbers, error=CaptureError)
 
 FIRST_HAND_JOINT = 25
 """In the order of SMPL-X: 30 finger joints follow."""

@@ -20,13 +20,19 @@ from humangs_jax.data.calibration.calibration import (
     Calibration,
     brown_conrady,
     in_capture_convention,
-    undistort_person,
 )
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
-from humangs_jax.data.datasets.multiview import ON_PERSON, checked_cameras
+from humangs_jax.data.datasets.bodies import (
+    FARTHEST,
+    LARGEST_ANGLE,
+    LARGEST_COEFFICIENT,
+    BodyParameters,
+    FileBody,
+    checked_numbers,
+    coefficients,
+)
+from humangs_jax.data.datasets.multiview import ON_PERSON, Photo, checked_cameras, video_subject
 from humangs_jax.data.datasets.subject import Subject
-from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, checked_numbers
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import Refused, check_limit, open_file, reading
 
@@ -103,49 +109,23 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     if not places:
         raise CaptureError(main, "", f"no camera: expected the groups {' and '.join(GROUPS)}")
     parameters = _parameters(notes, body)
-    count, missing = len(parameters.translations), {"no photo": 0, "no mask": 0, "no pose": 0}
-    cameras, shown = [], []
-    for owner, (number, group) in enumerate(sorted(places.items())):
-        there = {int(name) for name in photos.names(f"{group}/{number}/color") if name.isdecimal()}
-        masks = {int(name) for name in notes.names(f"Mask/{number}/mask") if name.isdecimal()}
-        missing["no photo"] += sum(frame not in there for frame in range(count))
-        missing["no pose"] += sum(frame >= count for frame in there)
-        missing["no mask"] += sum(frame not in masks for frame in there if frame < count)
-        shown += [(frame, owner) for frame in there & masks if frame < count]
-        first = f"{group}/{number}/color/{min(there)}" if there else None
-        cameras.append(_camera(notes, number, photos, first))
-    if not shown:
-        raise CaptureError(main, "", f"no photo with a mask and a pose ({missing})")
+    cameras, shown, masks = [], [], []
+    for number, group in sorted(places.items()):
+        there, masked = f"{group}/{number}/color", f"Mask/{number}/mask"
+        shown.append({int(name): f"{there}/{name}" for name in photos.names(there) if name.isdecimal()})
+        masks.append({int(name): f"{masked}/{name}" for name in notes.names(masked) if name.isdecimal()})
+        cameras.append(_camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None))
+
+    def read(photo: str, mask: str) -> Photo:
+        image = photos.image(photo)
+        person = (notes.image(mask).max(axis=-1) > ON_PERSON).astype(np.float32)
+        if person.shape != image.shape[:2]:
+            raise CaptureError(notes.path, mask, f"{person.shape}, its photo {image.shape[:2]}")
+        return np.where(person[..., None] > 0, image, np.float32(1)), person
+
     calibration = Calibration("DNA-Rendering", notes.path, tuple(cameras), False, "integer", "+y")
     cameras = checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
-    frames, owners = np.asarray(sorted(shown), np.int32).T
-    numbers = sorted(places)
-
-    def read(view: int):
-        number, camera, frame = numbers[owners[view]], cameras[owners[view]], frames[view]
-        image = photos.image(f"{places[number]}/{number}/color/{frame}")
-        channels = np.moveaxis(notes.image(f"Mask/{number}/mask/{frame}"), -1, 0)
-        mask = (np.maximum.reduce(list(channels)) > ON_PERSON).astype(np.float32)
-        if mask.shape != image.shape[:2]:
-            raise CaptureError(notes.path, f"Mask/{number}/mask/{frame}", f"{mask.shape}, its photo {image.shape[:2]}")
-        image = np.where(mask[..., None] > 0, image, np.float32(1))
-        return (
-            (image, mask) if camera.distortion is None else undistort_person(image, mask, camera.K, camera.distortion)
-        )
-
-    return Subject(
-        name=str(main),
-        K=np.stack([camera.K for camera in cameras])[owners],
-        cam_from_world=np.stack([camera.cam_from_world for camera in cameras])[owners],
-        sizes=np.asarray([(camera.width, camera.height) for camera in cameras])[owners],
-        frames=frames,
-        cameras=owners,
-        frame_count=count,
-        view_name=lambda view: f"{numbers[owners[view]]:02d}_{frames[view]:06d}",
-        read=read,
-        parameters=parameters.poses,
-        missing={reason: number for reason, number in missing.items() if number},
-    )
+    return video_subject(main, cameras, shown, masks, read, parameters, digits=6)
 
 
 def _parameters(notes, body):

@@ -1,15 +1,22 @@
-"""What THuman4.0, AvatarReX and ActorsHQ have in common: videos of synchronised cameras, and smpl_params.npz.
+"""Videos of synchronised cameras: THuman4.0 and AvatarReX, and what other such data sets share with them.
+
+    THuman4.0   3 subjects, 24 cameras of 1330 x 1150 (https://github.com/ZhengZerong/THUman4.0-Dataset)
+                subject0x/images/camNN/%08d.jpg    masks/camNN/%08d.jpg    calibration.json
+    AvatarReX   4 subjects, 16 cameras of 1500 x 2048 (https://github.com/ZhengZerong/AvatarReX)
+                avatarrex_*/SERIAL/%08d.jpg    SERIAL/mask/pha/%08d.jpg    calibration_full.json
+    both        smpl_params.npz    missing_img_files.txt (not always)
 
 Photos are numbered by frame, and a frame's number is the row of its pose. Masks are above 128 on the person.
 smpl_params.npz: global_orient, transl (m, 3), body_pose (m, 63), jaw_pose (m, 3), left/right_hand_pose (m, 45), betas and
 expression (1 or m, 10): SMPL-X, neutral, no principal components, flat_hand_mean TRUE (unlike THuman2.1), no poses of the eyes.
 """
 
-import dataclasses
+import functools
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -22,9 +29,16 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_camera
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
+from humangs_jax.data.datasets.bodies import (
+    FARTHEST,
+    LARGEST_ANGLE,
+    LARGEST_COEFFICIENT,
+    BodyParameters,
+    FileBody,
+    coefficients,
+    open_arrays,
+)
 from humangs_jax.data.datasets.subject import Subject
-from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import read_grey, read_image
 from humangs_jax.io.reading import read_text
@@ -33,6 +47,9 @@ PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255
 """Least value of a mask on the person: above 128."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+T = TypeVar("T")
+Photo = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
+"""Image on white and mask, both in [0, 1]."""
 _ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "left_hand_pose": 45, "right_hand_pose": 45}
 
 
@@ -98,17 +115,8 @@ def plain_number(stem: str) -> int | None:
     return int(stem) if stem.isdecimal() else None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Folders:
-    """Where the photos and masks of a camera are, and what turns a file's name (without suffix) into its frame."""
-
-    photos: Path
-    masks: Path
-    frame_of: Callable[[str], int | None] = plain_number
-
-
-def numbered(folder: Path, frame_of: Callable[[str], int | None]) -> dict[int, str]:
-    """Frame -> name of its file, of the photos in a folder; empty if it does not exist."""
+def numbered(folder: Path, frame_of: Callable[[str], int | None]) -> dict[int, Path]:
+    """Frame -> its file, of the photos in a folder; empty if it does not exist."""
     found = {}
     if folder.is_dir():
         with os.scandir(folder) as entries:
@@ -116,7 +124,7 @@ def numbered(folder: Path, frame_of: Callable[[str], int | None]) -> dict[int, s
                 stem, suffix = os.path.splitext(entry.name)
                 frame = frame_of(stem) if suffix.lower() in PHOTO_SUFFIXES else None
                 if frame is not None:
-                    found[frame] = entry.name
+                    found[frame] = folder / entry.name
     return found
 
 
@@ -139,48 +147,41 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
 def video_subject(
     name: Path,
     cameras: Sequence[CalibratedCamera],
-    folders: Mapping[str, Folders],
+    photos: Sequence[Mapping[int, T]],
+    masks: Sequence[Mapping[int, T]],
+    read: Callable[[T, T], Photo],
     parameters: BodyParameters,
-    listed: set[tuple[str, int]] = frozenset(),  # ty: ignore[invalid-parameter-default]
+    listed: Set[tuple[str, int]] = frozenset(),
+    digits: int = 8,
 ) -> Subject:
     """The photos of some cameras that have a mask and a pose, frame after frame and camera after camera.
 
-    folders: by the name of the camera. listed: (camera, frame) that are known to be missing.
+    photos, masks: of each camera by frame. read: a photo and its mask -> image on white and mask as 0 and 1. listed: (camera,
+    frame) that are known to be missing. digits: of a frame in the name of a view.
     Raises: CaptureError if there is no photo.
     """
     count, missing = len(parameters.translations), {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
-    shown, files = [], []
-    for number, camera in enumerate(cameras):
-        folder = folders[camera.name]
-        photos, masks = numbered(folder.photos, folder.frame_of), numbered(folder.masks, folder.frame_of)
+    shown = []
+    for number, (camera, there, masked) in enumerate(zip(cameras, photos, masks, strict=True)):
         known = {frame for owner, frame in listed if owner == camera.name}
+        usable = {frame for frame in there if frame not in known and 0 <= frame < count}
         missing["listed as missing"] += len(known)
-        missing["no photo"] += sum(frame not in photos and frame not in known for frame in range(count))
-        for frame, photo in photos.items():
-            if frame in known:
-                continue
-            if not 0 <= frame < count:
-                missing["no pose"] += 1
-            elif frame not in masks:
-                missing["no mask"] += 1
-            else:
-                shown.append((frame, number))
-                files.append((photo, masks[frame]))
+        missing["no photo"] += sum(frame not in there and frame not in known for frame in range(count))
+        missing["no pose"] += len(set(there) - known - usable)
+        missing["no mask"] += len(usable - set(masked))
+        shown += [(frame, number) for frame in usable & set(masked)]
+    missing = {reason: number for reason, number in missing.items() if number}
     if not shown:
-        told = ", ".join(f"{reason}: {number}" for reason, number in missing.items() if number)
+        told = ", ".join(f"{reason}: {number}" for reason, number in missing.items())
         raise CaptureError(name, "", f"no photo with a mask and a pose ({told or 'no cameras'})")
-    order = sorted(range(len(shown)), key=shown.__getitem__)
-    frames, owners = np.asarray(shown, np.int32)[order].T
-    files = [files[i] for i in order]
+    frames, owners = np.asarray(sorted(shown), np.int32).T
 
-    def read(view: int):
-        folder = folders[cameras[owners[view]].name]
-        photo, mask = files[view]
-        camera = cameras[owners[view]]
-        image, person = on_white(folder.photos / photo, folder.masks / mask)
-        if camera.distortion is None:
-            return image, person
-        return undistort_person(image, person, camera.K, camera.distortion)
+    def read_view(view: int) -> Photo:
+        frame, owner = int(frames[view]), int(owners[view])
+        image, person = read(photos[owner][frame], masks[owner][frame])
+        camera = cameras[owner]
+        lens = camera.distortion
+        return (image, person) if lens is None else undistort_person(image, person, camera.K, lens)
 
     return Subject(
         name=str(name),
@@ -190,11 +191,24 @@ def video_subject(
         frames=frames,
         cameras=owners,
         frame_count=count,
-        view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view]:08d}",
-        read=read,
+        view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view]:0{digits}d}",
+        read=read_view,
         parameters=parameters.poses,
-        missing={reason: number for reason, number in missing.items() if number},
+        missing=missing,
     )
+
+
+def folder_subject(
+    name: Path,
+    cameras: Sequence[CalibratedCamera],
+    folders: Sequence[tuple[Path, Path]],
+    parameters: BodyParameters,
+    listed: Set[tuple[str, int]] = frozenset(),
+    frame_of: Callable[[str], int | None] = plain_number,
+) -> Subject:
+    """`video_subject` of files in folders of each camera's photos and masks. frame_of: of a file's name without suffix."""
+    photos, masks = ([numbered(folder, frame_of) for folder in part] for part in zip(*folders, strict=True))
+    return video_subject(name, cameras, photos, masks, on_white, parameters, listed)
 
 
 def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
@@ -205,3 +219,44 @@ def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float
         got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
         raise CaptureError(mask, "size", f"{got}: expected the same")
     return np.where(person[..., None], image, np.float32(1)), person.astype(np.float32)
+
+
+class FolderLayout(NamedTuple):
+    """Where the files of a data set are: calibration, and the photos and masks of a camera NAME."""
+
+    calibration: str
+    photos: str
+    masks: str
+
+
+THUMAN4 = FolderLayout("calibration.json", "images/NAME", "masks/NAME")
+AVATARREX = FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
+
+
+def find_subjects(layout: FolderLayout, folder: str | Path) -> tuple[Path, ...]:
+    """The subjects in a folder, sorted, or the folder itself; empty if there are none."""
+    above = layout.photos.replace("NAME", "")
+    is_one = lambda path: (path / layout.calibration).is_file() and (path / above).is_dir()
+    return subfolders(folder, is_one)
+
+
+def subfolders(folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1) -> tuple[Path, ...]:
+    """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
+    folder = Path(folder)
+    below = (path for level in range(depth) for path in folder.glob("*/" * (level + 1)))
+    return (folder,) if is_one(folder) else tuple(sorted(path for path in below if is_one(path)))
+
+
+def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Subject:
+    """One subject; nothing but calibration, poses and names of files is read. Raises: CaptureError naming file and key."""
+    folder = Path(folder)
+    cameras = read_cameras(folder / layout.calibration)
+    place = lambda part, camera: folder / part.replace("NAME", camera.name)
+    places = [(place(layout.photos, camera), place(layout.masks, camera)) for camera in cameras]
+    return folder_subject(
+        folder, cameras, places, read_parameters(folder / PARAMETERS, body), read_missing(folder / MISSING)
+    )
+
+
+find_thuman4, open_thuman4 = (functools.partial(do, THUMAN4) for do in (find_subjects, open_subject))
+find_avatarrex, open_avatarrex = (functools.partial(do, AVATARREX) for do in (find_subjects, open_subject))

@@ -19,9 +19,15 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, recover_pose, recover_shape
+from humangs_jax.data.datasets.bodies import (
+    BodyParameters,
+    FileBody,
+    checked_numbers,
+    open_arrays,
+    recover_pose,
+    recover_shape,
+)
 from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
-from humangs_jax.data.datasets.values import checked_numbers, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size, read_grey, read_image
 from humangs_jax.io.npz import write_npz
@@ -46,10 +52,17 @@ class SceneFrame(NamedTuple):
     mask: str | None = None
 
 
-def is_scene_list(path: str | Path) -> bool:
-    """Whether this is a list of scenes, or a folder that holds one."""
+def find_scene_list(path: str | Path) -> tuple[Path, ...]:
+    """The path, if it is a list of scenes or a folder that holds one."""
     path = Path(path)
-    return (path.is_file() and path.suffix == ".json") or any((path / name).is_file() for name in LISTS)
+    found = (path.is_file() and path.suffix == ".json") or any((path / name).is_file() for name in LISTS)
+    return (path,) if found else ()
+
+
+def _list_of(path: str | Path) -> Path:
+    """The JSON file; of a folder train.json, else test.json."""
+    file = Path(path)
+    return next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0]) if file.is_dir() else file
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -57,9 +70,7 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 
     Raises: CaptureError naming file and key.
     """
-    file = Path(path)
-    if file.is_dir():
-        file = next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+    file = _list_of(path)
     content = checked_json(file)
     if not isinstance(content, list) or not content:
         raise CaptureError(file, "", f"expected a list of scenes, got {type(content).__name__}")
@@ -79,9 +90,7 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
 
     Raises: CaptureError if the list cannot be read.
     """
-    file = Path(path)
-    if file.is_dir():
-        file = next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+    file = _list_of(path)
     scenes = read_scene_list(file)
     if size is None:
         size = _first_size(file, scenes)

@@ -9,13 +9,16 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import Capture, capture_from_arrays
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody
+from humangs_jax.data.formats import DATASETS
 from humangs_jax.data.loading.examples import StoredSubject
 from humangs_jax.io.images import resized, to_uint8
 
@@ -165,3 +168,23 @@ class Person:
         _, rotations, translations = self.subject.parameters(seen.tolist())
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
         return subject._replace(frames=frames.astype(np.int32), rotations=rotations, translations=translations)
+
+
+def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
+    """The people of a data set of any layout that has photos (`data.formats.DATASETS`); each is opened when it is asked for.
+
+    Arguments: size: pixels a side of the stored squares; None: that of the images of a scene list, else `STORED_SIZE`.
+    Raises: CaptureError if the folder has none of the layouts.
+    """
+    path = Path(path)
+    for name, data_set in DATASETS.items():
+        if not (folders := imported(data_set.find)(path)):
+            continue
+        if data_set.scans:
+            raise CaptureError(path, "", f"scans have no photos: make some with `humangs preprocess {name}`")
+        if data_set.lists:
+            return data_set(path, body, size)
+        opened = lambda folder, open_one=data_set: functools.partial(open_one, folder, body)
+        return tuple(Person(str(folder), opened(folder), size or STORED_SIZE) for folder in folders)
+    known = ", ".join(each.about for each in DATASETS.where(lambda each: not each.lists).values())
+    raise CaptureError(path, "", f"no captures, scene list or data set of {known} (docs/datasets.md)")

@@ -22,8 +22,17 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, coefficients, posed_people
-from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
+from humangs_jax.data.datasets.bodies import (
+    FARTHEST,
+    LARGEST_ANGLE,
+    LARGEST_COEFFICIENT,
+    BodyParameters,
+    FileBody,
+    PosedPerson,
+    coefficients,
+    open_arrays,
+    posed_people,
+)
 from humangs_jax.io.images import check_image
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.reading import Refused, read_text, reading
@@ -78,6 +87,12 @@ class ThumanSet:
     def fit_file(self, name: str) -> Path:
         """The fit of a scan."""
         return self.folder / "smplx" / name / FIT
+
+
+def find_thuman(folder: str | Path) -> tuple[Path, ...]:
+    """The folder, if it holds scans."""
+    folder = Path(folder)
+    return (folder,) if (folder / "model").is_dir() and (folder / "smplx").is_dir() else ()
 
 
 def open_thuman(folder: str | Path) -> ThumanSet:

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 from humangs_jax.data.datasets.bodies import BodyParameters, posed_people
-from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
-from humangs_jax.data.preprocess.run import preprocess
-from humangs_jax.data.preprocess.scenes import Settings, scan_content
+from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.io.reading import FileError
 
 MOST_BYTES, MOST_SECONDS = 300 << 20, 10.0

@@ -1,23 +1,37 @@
 """`humangs preprocess`: what is written, what is skipped and why; interrupted, resumed, in shards."""
 
+import importlib
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_files import CAMERAS, FRAMES, model_arrays, write_avatarrex, write_model, write_thuman, write_thuman4
+from command_line import run as in_process
+from dataset_files import (
+    CAMERAS,
+    FRAMES,
+    model_arrays,
+    write_actorshq,
+    write_avatarrex,
+    write_model,
+    write_thuman,
+    write_thuman4,
+)
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.cli import training
 from humangs_jax.cli.training import Preprocess, ScanViews
+from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.bodies import posed_people
-from humangs_jax.data.datasets.opening import open_people
 from humangs_jax.data.datasets.scene_list import read_scene_list
+from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.formats import DATASETS, DataSetFormat
 from humangs_jax.data.loader import find_captures
+from humangs_jax.data.preprocess import run as set_run
 from humangs_jax.data.preprocess.rendering import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
-from humangs_jax.data.preprocess.run import preprocess
-from humangs_jax.data.preprocess.scenes import Settings
+from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.io import atomic
 from humangs_jax.io.images import read_image
 
@@ -116,9 +130,7 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
 
 
 def test_a_kill_leaves_nothing_half_written(videos, tmp_path, body, monkeypatch):
-    from humangs_jax.data.preprocess import scenes
-
-    written, write = [], scenes.write_png
+    written, write = [], set_run.write_png
 
     def die(path, image):
         written.append(path)
@@ -127,7 +139,7 @@ def test_a_kill_leaves_nothing_half_written(videos, tmp_path, body, monkeypatch)
         write(path, image)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(scenes, "write_png", die)
+        patch.setattr(set_run, "write_png", die)
         run(videos, tmp_path / "out", body, settings())
     assert not list((tmp_path / "out").glob("*/scene.json")) and not list((tmp_path / "out").glob(".*"))
     # a process that is killed at once leaves a temporary folder, which the next one removes
@@ -206,6 +218,36 @@ def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, bo
     run(source, tmp_path / "less", body, options)
     less = json.loads((tmp_path / "less" / "manifest.json").read_text())["split"]
     assert less == {"train": whole["train"][1:], "test": whole["test"]}
+
+
+def test_a_data_set_is_one_line_of_the_table(tmp_path, body, monkeypatch, capsys):
+    """Known to the choices and the help of the command, to `preprocess`, and to what opens people for training."""
+    found = lambda folder: tuple(sorted(folder.glob("*.toy")))
+    opened = lambda path, own: open_people(path.with_suffix(""), own)[0].subject
+    monkeypatch.setitem(DATASETS, "toy", DataSetFormat("made up", opened, find=found))
+    write_avatarrex(tmp_path / "raw" / "a" / "avatarrex_a")
+    (tmp_path / "raw" / "a.toy").touch()
+    monkeypatch.setattr(training, "Preprocess", training.Preprocess)  # reloading replaces it
+    importlib.reload(training)
+    said = " ".join(in_process(monkeypatch, capsys, "preprocess", "--help")[1].replace("│", " ").split())
+    assert ",toy}" in said and "; toy: made up" in said
+    words = ("preprocess", "toy", tmp_path / "raw", "--out", tmp_path / "out", "--body", body.file, "--size", SIZE)
+    code, out, error = in_process(monkeypatch, capsys, *words)
+    assert code == 0 and "1 scenes, 2 views" in out, error
+    assert [person.name for person in open_people(tmp_path / "raw", body)] == [str(tmp_path / "raw" / "a.toy")]
+
+
+@pytest.mark.parametrize("each", DATASETS.values(), ids=DATASETS)
+def test_every_row_names_code_that_is_there(each):
+    assert callable(imported(each.code)) and callable(imported(each.find))
+
+
+def test_sequences_of_several_actors_have_names_of_their_own(tmp_path, body):
+    for actor in ("Actor01", "Actor02"):
+        write_actorshq(tmp_path / "raw" / actor / "Sequence1")
+    report = preprocess(tmp_path / "raw", tmp_path / "out", body.file, Settings("actorshq", size=SIZE), progress=False)
+    assert report.scenes == 2
+    assert list(read_scene_list(tmp_path / "out")) == ["Actor01_Sequence1", "Actor02_Sequence1"]
 
 
 def test_the_working_folder_may_be_the_data_set(videos, tmp_path, body, monkeypatch):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.preprocess import protocol
-from humangs_jax.data.preprocess.scenes import Settings, scan_content
+from humangs_jax.data.preprocess.run import Settings, scan_content
 
 PUBLISHED = 2e-4
 """Of the body's size, the bound that the arrays have to keep."""
