@@ -153,7 +153,7 @@ def test_joints_that_do_not_suffice_are_refused(body, truth, tmp_path):
     some = {name: point for name, point in given_joints(truth).items() if name in ("left_hip", "nose")}
     with pytest.raises(ValueError, match="at least three points"):
         fit_scan(path, body=body, joints=some, config=QUICK)
-    with pytest.raises(ValueError, match="--height 170"):
+    with pytest.raises(ValueError, match="height 170"):
         fit_scan(path, body=body, joints=some, height=170.0, config=QUICK)
 
 

@@ -57,7 +57,7 @@ def test_what_a_detector_sees_comes_back_as_joints_of_the_scan(tmp_path):
 
 def test_wrong_axes_and_full_folders_are_refused(tmp_path):
     blocks(tmp_path / "scan.ply")
-    with pytest.raises(ValueError, match="--up y: expected one of"):
+    with pytest.raises(ValueError, match="up y: expected one of"):
         render_scan_views(tmp_path / "scan.ply", tmp_path / "views", up="y")
     with pytest.raises(ValueError, match="not empty"):
         render_scan_views(tmp_path / "scan.ply", tmp_path)
