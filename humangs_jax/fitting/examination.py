@@ -31,6 +31,10 @@ OUTLIER = 5.0
 """Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the last stage of a fit."""
 
 
+REMEDIES = "`humangs fit` turns it back", "give its photos to other frames"
+"""Of cameras that are turned, and late."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
     """The report on a body and keypoints, and the arrays behind it, of v views, m frames and k keypoints.
@@ -92,7 +96,7 @@ def examine(
         notes=_worst_frame(frames),
         warnings=(
             *(
-                f"{error}, as the keypoints show: `humangs fit` turns it back"
+                f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}"
                 for error in find_camera_errors(capture, keypoints)
             ),
             *keypoint_warnings(rows, expected, violations, swaps),

@@ -35,7 +35,7 @@ FAR = 4.0
 class FittedCapture:
     """A fit in memory: the capture with its body, the record that is stored beside it, and what the solver did.
 
-    camera_errors: of the calibration, which the capture's cameras are without.
+    camera_errors: turns of cameras, which the capture's are without.
     """
 
     capture: Capture
@@ -85,7 +85,7 @@ def fit_photos(
         raise ValueError(
             f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
         )
-    errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
+    errors = () if fixed_cameras else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
     photos = mended(photos, errors) if errors else photos
     model = landmark_model(without_expression(body), keypoints.set.names, keypoints.set.places)
     observations, _ = group_by_frame(photos, keypoints)

@@ -29,16 +29,22 @@ def _landmarks(names):
     return jax.jit(jax.vmap(lambda pose: pose_landmarks(model, jnp.zeros(4), pose)[0]))
 
 
-def person(seed, frames, views, *, still=False, even=False, outliers=0.0, kind=COCO_17):
+def person(seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17):
     """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1, ...
 
-    still: cameras are the same for all frames. even: evenly spaced around the person.
+    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from one pose to another in 8 frames,
+    and not at random.
     """
     rng = np.random.default_rng(seed)
     prior = pose_prior(body().joint_names)
     rotations = prior.mean + prior.std * rng.normal(0, 0.7, (frames, *prior.mean.shape))
     rotations = np.clip(rotations, prior.lower, prior.upper)
     rotations[:, 0] = [[0, angle, 0] for angle in rng.uniform(-np.pi, np.pi, frames)]
+    if moving:
+        rotations[:, 0] = rotations[0, 0]
+        whole, share = np.divmod(np.arange(frames) / 8, 1)
+        share = (1 - np.cos(np.pi * share[:, None, None])) / 2
+        rotations = rotations[whole.astype(int)] * (1 - share) + rotations[whole.astype(int) + 1] * share
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.zeros((frames, 3)))
     cameras = _cameras(rng, frames, views, still, even)
     landmarks = np.asarray(_landmarks(kind.names)(poses))
