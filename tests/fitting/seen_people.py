@@ -32,8 +32,8 @@ def _landmarks(names):
 def person(seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17):
     """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1, ...
 
-    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from one pose to another in 8 frames,
-    and not at random.
+    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from one pose to another in 8
+    frames, and not at random.
     """
     rng = np.random.default_rng(seed)
     prior = pose_prior(body().joint_names)
