@@ -1,10 +1,13 @@
 """Photos without a calibration -> a capture without a body: the people in them are found, and from the person the cameras.
 
-See `fitting.person_cameras`; who is who in several photos: `apps.detect`.
+See `fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are reduced first: nothing that comes
+after looks at more than some hundred pixels of a person.
 """
 
 import dataclasses
+import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +19,10 @@ from humangs_jax.data.calibration.importing import import_calibration
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, PersonViews, cameras_from_person
-from humangs_jax.io.images import DIAGONAL_35MM, focal_length
+from humangs_jax.io.images import DIAGONAL_35MM, focal_length, image_size, resized, write_png
+
+LONGEST, LEAST_PERSON = 2048, 700
+"""Pixels: longest side to which photos are reduced, and size of the person there below which they stay as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,30 +46,75 @@ def import_photos(
     height: float | None = None,
     masks: Path | None = None,
     own_masks: bool = True,
+    reduce: bool = False,
 ) -> PhotosImported:
     """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what is there is replaced.
 
     Arguments: person: number on people.png, where several may be meant. height: of the person, metres. masks: folder of masks of
-    another program. own_masks: whether the detector's masks are written.
+    another program. own_masks: whether the detector's masks are written. reduce: whether large photos may be reduced.
     Raises: ValueError (one line) if no camera is found or several people may be meant; as `import_cameras`.
     """
     images, files = photo_files(folder)
-    names = [file.relative_to(images).as_posix() for file in files]
-    photos = detect.same_people(detect.detect_photos(names, map(detect.upright, files)))
+    with tempfile.TemporaryDirectory() as place:
+        if reduce and (smaller := _reduced(images, files, Path(place))):
+            found = _look(Path(place), files, smaller, person, out)
+            if min(np.ptp(each.person.points[:, :2], axis=0).max() for each in found.people) >= LEAST_PERSON:
+                return _written(found, Path(place), out, height, None, own_masks)
+    return _written(_look(images, files, files, person, out), images, out, height, masks, own_masks)
+
+
+def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
+    """The photos, upright and not larger than `LONGEST`, in a folder; none if they are small as they are."""
+    names = {file.relative_to(images).with_suffix(".png") for file in files}
+    if max(max(image_size(file)) for file in files) <= LONGEST or len(names) < len(files):
+        return []
+    found = [place / file.relative_to(images).with_suffix(".png") for file in files]
+    for file, smaller in zip(files, found, strict=True):
+        photo = detect.upright(file)
+        height, width = photo.shape[:2]
+        factor = min(1.0, LONGEST / max(height, width))
+        smaller.parent.mkdir(parents=True, exist_ok=True)
+        write_png(smaller, resized(photo, round(factor * width), round(factor * height)), compress_level=1)
+    return found
+
+
+class _Looked(NamedTuple):
+    """photos: all of them. shown: those with the person `number`. people: of these. seen: of these."""
+
+    photos: list[PhotoPeople]
+    number: int
+    shown: list[int]
+    people: list[detect.Found]
+    seen: PersonViews
+
+
+def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | None, out: Path) -> _Looked:
+    """Who is in the photos. looked_at: the files, or their reduced copies in the folder `images`."""
+    names = [file.relative_to(images).as_posix() for file in looked_at]
+    photos = detect.same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
     # beside `out`, which a refusal leaves as it is
     number = detect.chosen(photos, person, out, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
-    focal = [focal_length(files[i]) for i in shown]
+    known = ((focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size)) for i in shown)
+    focal = [np.nan if each is None else each * now / before for each, before, now in known]
     seen = PersonViews(
         points=np.stack([found.person.points[:, :2] for found in people]),
         visibility=np.stack([found.person.points[:, 2] for found in people]),
         world=np.stack([found.person.world for found in people]),
         names=MEDIAPIPE_33.names,
         sizes=tuple(photos[i].size for i in shown),
-        focal=np.asarray([np.nan if each is None else each for each in focal]),
+        focal=np.asarray(focal),
         photos=tuple(names[i] for i in shown),
     )
+    return _Looked(photos, number, shown, people, seen)
+
+
+def _written(
+    looked: _Looked, images: Path, out: Path, height: float | None, masks: Path | None, own_masks: bool
+) -> PhotosImported:
+    """The capture folder with cameras from the person."""
+    photos, number, shown, _, seen = looked
     found = cameras_from_person(seen, height=height)
     calibration = _calibration(seen, found, images)
     report = import_calibration(calibration, images, out, masks=masks)

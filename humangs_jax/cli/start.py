@@ -140,6 +140,7 @@ class Start:
                 height=self.height,
                 masks=material.masks,
                 own_masks=own_masks,
+                reduce=not (material.keypoints or material.masks or material.alpha),
             )
             write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
         tell("\n".join(found.lines))

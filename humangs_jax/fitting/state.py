@@ -11,7 +11,6 @@ The root turns by global_orient after the origin's rotation, because sums of rot
 small turns.
 """
 
-import dataclasses
 import math
 
 import jax.numpy as jnp
@@ -27,26 +26,28 @@ from humangs_jax.geometry.camera import Camera
 
 LOG_SCALE_STD = 0.05
 """Unit of `FitState.log_scale`."""
+RADIANS = math.pi / 180
+"""Per degree."""
 SAME = 1e-4
 """Relative difference of focal lengths, and radians and metres of cameras, below which two are the same."""
 
 
-@dataclasses.dataclass(frozen=True)
+@pytree_dataclass
 class StateStd:
-    """Expected size of the deviations, standard deviations.
+    """Expected size of the deviations, standard deviations. Numbers, or arrays () where a program is compiled for all of them.
 
     focal: share. camera_rotation, global_orient, body_pose (each joint): degrees, by axis. camera_center, transl: metres, by
     axis. betas: of coefficients. clothing: thickness of clothes and hair on each segment of the body, metres.
     """
 
-    focal: float = 0.05
-    camera_rotation: float = 2.0
-    camera_center: float = 0.05
-    global_orient: float = 3.0
-    transl: float = 0.05
-    body_pose: float = 4.0
-    betas: float = 0.3
-    clothing: float = 0.03
+    focal: Float[Array, ""] | float = 0.05
+    camera_rotation: Float[Array, ""] | float = 2.0
+    camera_center: Float[Array, ""] | float = 0.05
+    global_orient: Float[Array, ""] | float = 3.0
+    transl: Float[Array, ""] | float = 0.05
+    body_pose: Float[Array, ""] | float = 4.0
+    betas: Float[Array, ""] | float = 0.3
+    clothing: Float[Array, ""] | float = 0.03
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
@@ -95,7 +96,8 @@ class Origin:
     """Where zeros are, and the unit of each number.
 
     betas: (s,). pose: of one frame or a batch of m. body_pose_std: (a, 3) radians. segment: (j,) which number of
-    `FitState.clothing` covers what a joint moves. Static: joints, the a free ones besides the root (joint 0); std.
+    `FitState.clothing` covers what a joint moves. std: of what moves. Static: joints, the a free ones besides the root
+    (joint 0).
     """
 
     betas: Float[Array, " s"]
@@ -104,7 +106,7 @@ class Origin:
     cameras: CameraOrigin | None = None
     segment: Int[Array, " j"] | None = None
     joints: tuple[int, ...] = static_field(default=())
-    std: StateStd = static_field(default=FREE)
+    std: StateStd = FREE
 
     @property
     def views(self) -> CameraOrigin:
@@ -154,7 +156,7 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
     """The pose, or the batch of poses; differentiable everywhere. Joints that are not free are as in the origin."""
     rotations = origin.pose.rotations
     rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(origin.body_pose_std * state.body_pose)
-    turn = quaternion.from_axis_angle(math.radians(origin.std.global_orient) * state.global_orient)
+    turn = quaternion.from_axis_angle(RADIANS * origin.std.global_orient * state.global_orient)
     root = quaternion.multiply(turn, quaternion.from_axis_angle(origin.pose.rotations[..., 0, :]))
     rotations = rotations.at[..., 0, :].set(quaternion.to_axis_angle(root))
     translation = origin.pose.translation + origin.std.transl * state.transl
@@ -169,7 +171,7 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
     turned = pose.rotations[..., joints, :] - start.rotations[..., joints, :]
     return FitState(
         betas=(betas - origin.betas) / origin.std.betas,
-        global_orient=quaternion.to_axis_angle(turn) / math.radians(origin.std.global_orient),
+        global_orient=quaternion.to_axis_angle(turn) / (RADIANS * origin.std.global_orient),
         transl=(pose.translation - start.translation) / origin.std.transl,
         body_pose=turned / origin.body_pose_std,
     )
@@ -183,7 +185,7 @@ def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], 
     start, moved, std = origin.views, state.cameras, origin.std
     if moved is None:
         return start.K, start.cam_from_world
-    turn = quaternion.matrix_from_axis_angle(math.radians(std.camera_rotation) * moved.rotations[start.camera])
+    turn = quaternion.matrix_from_axis_angle(RADIANS * std.camera_rotation * moved.rotations[start.camera])
     center = transform.invert_rigid(start.cam_from_world)[:, :3, 3] + std.camera_center * moved.centers[start.camera]
     rotation = jnp.matmul(turn, start.cam_from_world[:, :3, :3], precision=EXACT)
     translation = -jnp.einsum("vab,vb->va", rotation, center, precision=EXACT)

@@ -152,20 +152,23 @@ def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
     return pixels[:: -1 if flag in rows else 1, :: -1 if flag in columns else 1]
 
 
-def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> None:
+def write_png(
+    path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], compress_level: int = 6
+) -> None:
     """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
 
-    A fourth channel is alpha. The file appears whole or not at all. Raises: OSError if it cannot be written.
+    A fourth channel is alpha. compress_level: of zlib; 1 takes a third of the time and a sixth more room. The file appears whole
+    or not at all. Raises: OSError if it cannot be written.
     """
-    replace_file(path, lambda temporary: temporary.write_bytes(png_bytes(image)))
+    replace_file(path, lambda temporary: temporary.write_bytes(png_bytes(image, compress_level)))
 
 
-def png_bytes(image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> bytes:
+def png_bytes(image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], compress_level: int = 6) -> bytes:
     """The content of the file that `write_png` writes."""
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(to_uint8(image)).save(file, format="PNG")
+    Image.fromarray(to_uint8(image)).save(file, format="PNG", compress_level=compress_level)
     return file.getvalue()
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments.fitting.your_photos import landmarks_in, write_material
 from humangs_jax import cli
-from humangs_jax.apps import detect
+from humangs_jax.apps import detect, photos_alone
 from humangs_jax.apps.detect import Found, PhotoPeople
 from humangs_jax.apps.start import look, missing
 from humangs_jax.avatar.avatar import Avatar
@@ -23,7 +24,7 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import blazepose
 from humangs_jax.fitting import fit_capture
-from humangs_jax.io.images import to_uint8, write_png
+from humangs_jax.io.images import read_image, to_uint8, write_png
 
 DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 NEEDED = ("cameras", "masks", "keypoints")
@@ -254,6 +255,30 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     # of cameras without a common world: distances between them, over the first
     apart = lambda points: np.linalg.norm(points[1:] - points[0], axis=-1)
     np.testing.assert_allclose(apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2)
+
+
+def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypatch):
+    folders = [tmp_path / name for name in ("photos", "reduced")]
+    (folders[0] / "left").mkdir(parents=True)
+    picture = Image.fromarray(np.kron(np.asarray([[0, 255]], np.uint8), np.ones((60, 60), np.uint8)))
+    picture.save(folders[0] / "left/a.png")
+    lying = Image.Exif()
+    lying[0x0112] = 6
+    picture.resize((240, 120)).save(folders[0] / "b.jpg", exif=lying)
+    files = [folders[0] / "left/a.png", folders[0] / "b.jpg"]
+    assert photos_alone._reduced(folders[0], files, folders[1]) == []
+    monkeypatch.setattr(photos_alone, "LONGEST", 80)
+    found = photos_alone._reduced(folders[0], files, folders[1])
+    assert [str(file.relative_to(folders[1])) for file in found] == ["left/a.png", "b.png"]
+    first, second = (read_image(file)[0][..., 0] for file in found)
+    assert (
+        first.shape == (40, 80)
+        and second.shape == (80, 40)
+        and first[0, -1] == 1
+        and second[-1, 0] > 0.9 > 0.1 > second[0, 0]
+    )
+    shutil.copy(files[0], folders[0] / "b.png")  # of the same name, but for the suffix
+    assert photos_alone._reduced(folders[0], [*files, folders[0] / "b.png"], folders[1]) == []
 
 
 def test_a_height_without_a_use_is_refused(mine, detected, capsys):
