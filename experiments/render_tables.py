@@ -1,18 +1,21 @@
-"""Tables of README.md and docs/ from docs/results/*.json.
+"""Tables of README.md and docs/ from docs/results/*.json, and those of formats from the package.
 
     python experiments/render_tables.py [--check]
 
 Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds (format:
 `experiments/common/results.py`). --check writes nothing; exit status 1 if a page differs from its JSON files, if a section has
-no file, or if a file is shown nowhere.
+no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ... `<!-- end -->` becomes the formats that the package reads.
 """
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from experiments.common.results import REPOSITORY, SECTION, rendered, write_text
+
+FORMATS = re.compile(r"(?<=<!-- formats: )(?P<name>\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
 def main() -> int:
@@ -38,11 +41,37 @@ def render_pages(repository: Path, write: bool) -> list[str]:
         ]
         shown.update(names)
         new = rendered(old, results, [name for name in names if name in known])
+        new = FORMATS.sub(lambda match: match["name"] + match[2] + format_table(match["name"]), new)
         if new != old and write:
             write_text(page, new)
         elif new != old:
             faults.append(f"{page.name}: differs from docs/results; run experiments/render_tables.py")
     return faults + [f"docs/results/{name}.json: shown on no page" for name in sorted(known - shown)]
+
+
+def format_table(name: str) -> str:
+    """The "cameras" or "keypoints" that are read, as a table in Markdown."""
+    from humangs_jax.data.formats import CAMERAS, KEYPOINTS
+
+    centers = {"half": "+0.5", "integer": "whole numbers"}
+    quoted = lambda files: ", ".join(f"`{file}`" for file in files)
+    if name == "cameras":
+        header = ("format", "usual names", "content", "pixel centres", "up", "one camera for each")
+        rows = [
+            (
+                each.about,
+                quoted(each.names),
+                each.content,
+                centers[each.pixel_centers],
+                each.up,
+                ("camera", "image")[each.per_image],
+            )
+            for each in CAMERAS.values()
+        ]
+    else:
+        header = ("format", "usual names", "content")
+        rows = [(each.about, quoted(each.names), each.content) for each in KEYPOINTS.values()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
 
 
 if __name__ == "__main__":

@@ -1,36 +1,39 @@
-"""A look at a capture before its use: the posed body over each photo, and numbers that show what is wrong.
+"""A look at a capture before its use, and at a fit: the posed body over each photo, and numbers that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the silhouette of the body; photo and body
-should coincide. Most captures that fail have a wrong convention: a view whose body is not where the mask is, is tried again
-with each usual mistake undone, and the mistake that explains it is named.
+Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. What is
+wrong with a view is said by `apps.quick_check`.
+
+On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
+the cross of the body's landmark; where the body fits, disc and cross coincide. Below it: the error over time.
 """
 
 import dataclasses
-import functools
+import itertools
+import json
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_erosion
 
-from humangs_jax.apps.quick_check import (
-    LEAST_INSIDE,
-    LEAST_IOU,
-    MISTAKES,
-    SURELY_INSIDE,
-    SURELY_IOU,
-    whole_capture_mistakes,
-)
-from humangs_jax.avatar.sheets import contact_sheet
+from humangs_jax.apps.quick_check import faults
+from humangs_jax.avatar.sheets import contact_sheet, tile
+from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
-from humangs_jax.core.array_types import Array, Bool, Float
-from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.masks import person_box
+from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.fitting.camera_errors import find_camera_errors
+from humangs_jax.fitting.examination import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.images import to_uint8, write_png
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
@@ -43,8 +46,6 @@ WIDER = (
     "`humangs fit CAPTURE --refine{}` fits {}shape and pose to the masks"
 )
 FIXED, FREE = (" --fixed-cameras", ""), ("", "cameras, ")
-LEAST_HEIGHT = 0.05
-"""Share of the image's height: a body smaller than this has its lengths in another unit."""
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
 BOUNDARY = (0.1, 0.85, 0.2)
 AMBIENT = 0.35
@@ -53,29 +54,23 @@ OPACITY = 0.55
 
 @pytree_dataclass
 class BodyImage:
-    """The posed body as one camera sees it.
-
-    shaded: (h, w, 3) lit from the camera, black outside. covered: (h, w). inside, before: shares of the vertices that fall
-    into the image, and that lie before the camera. height: of the body in the image, share of the image's.
-    """
+    """The posed body as one camera sees it. shaded: (h, w, 3) lit from the camera, black outside. covered: (h, w)."""
 
     shaded: Float[Array, "h w 3"]
     covered: Bool[Array, "h w"]
-    inside: Float[Array, ""]
-    before: Float[Array, ""]
-    height: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewCheck:
-    """One view. iou: of body and mask, outside: share of the body's pixels more than one pixel off the mask; None without masks.
-    inside: share of the vertices in the image.
-    """
+    """One view."""
 
     name: str
     iou: float | None
+    """Of body and mask; None without masks."""
     outside: float | None
+    """Share of the body's pixels that are more than one pixel off the mask."""
     inside: float
+    """Share of the body in the image."""
     warnings: tuple[str, ...] = ()
 
 
@@ -116,29 +111,22 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     Raises: OSError if the sheet cannot be written.
     """
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
+    whole, found = faults(capture)
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
-    vertices = _posed_frames(capture)
-    tints = side_tints(capture.body)
+    vertices, tints = _posed_frames(capture), side_tints(capture.body)
     overlays, views = [], []
-    for i, name in enumerate(capture.names):
-        posed = vertices[int(capture.frames[i])]
-        drawn = _body_image(posed, capture.body.faces, tints, capture.cameras[i])
-        mask = None if capture.masks is None else capture.masks[i] > 0.5
-        view = _judge(name, drawn, mask)
-        if view.warnings:
-            translation = np.asarray(capture.poses.translation[int(capture.frames[i])], float)
-            draw = functools.partial(_body_image, posed, capture.body.faces, tints)
-            cause = _mistake_in_image(drawn, mask) or _mistake_in_space(draw, capture.cameras[i], translation, mask)
-            explained = f"it would fit if {cause}"
-            view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
-        elif view.outside is not None and view.outside > MOST_OUTSIDE:
-            view = dataclasses.replace(view, warnings=(WIDER.format(view.outside, *(FIXED if right else FREE)),))
+    for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
+        drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
+        iou, outside, warnings = None, None, () if fault.problem is None else (fault.problem,)
+        if capture.masks is not None:
+            iou, outside = _agreement(np.asarray(drawn.covered), capture.masks[i] > MASK_THRESHOLD)
+            if not warnings and outside > MOST_OUTSIDE:
+                warnings = (WIDER.format(outside, *(FIXED if right else FREE)),)
         overlays.append(overlay(capture.images[i], drawn))
-        views.append(view)
+        views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    off = any(view.warnings for view in views)
-    return CheckReport(tuple(views), whole_capture_mistakes(capture) if off else ())
+    return CheckReport(tuple(views), whole)
 
 
 def draw_body(
@@ -171,95 +159,218 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 
 @jax.jit
-def _body_image(vertices, faces, tints, camera) -> BodyImage:
+def _body_image(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], tints: Float[Array, "n 3"], camera: Camera
+) -> BodyImage:
     points = transform.apply(camera.cam_from_world, vertices)
-    before = points[:, 2] > 0
-    xy = points[:, :2] / jnp.where(before, points[:, 2], 1.0)[:, None] * jnp.diagonal(camera.K)[:2] + camera.K[:2, 2]
-    inside = before & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
-    y = jnp.where(before, xy[:, 1], 0.0)
     rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
     rotation = camera.cam_from_world[:3, :3]
     normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)
     light = AMBIENT + (1 - AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
     fragments = rasterize_mesh(vertices, faces, camera)
-    return BodyImage(
-        shaded=interpolate_attributes(fragments, faces, tints * light, jnp.zeros(3)),
-        covered=fragments.face_ids >= 0,
-        inside=inside.mean(dtype=jnp.float32),
-        before=before.mean(dtype=jnp.float32),
-        height=(y.max() - y.min()) / camera.height,
-    )
+    shaded = interpolate_attributes(fragments, faces, tints * light, jnp.zeros(3))
+    return BodyImage(shaded, fragments.face_ids >= 0)
 
 
-def _posed_frames(capture):
+def _posed_frames(capture: Capture) -> dict[int, Float[Array, "n 3"]]:
     """Vertices of the frames that views show, by frame."""
     pose = jax.jit(person_vertices)
     shown = sorted({int(frame) for frame in capture.frames})
     return {frame: pose(capture.body, jnp.asarray(capture.betas), capture.pose(frame)) for frame in shown}
 
 
-def _iou(drawn, mask):
-    covered = np.asarray(drawn.covered)
-    union = (covered | mask).sum()
-    return float((covered & mask).sum() / union) if union else 0.0
+def _agreement(covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Intersection over union of body and mask, and the share of the body more than one pixel off the mask."""
+    union = max((covered | mask).sum(), 1)
+    return float((covered & mask).sum() / union), float(
+        (covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1)
+    )
 
 
-def _outside(drawn, mask):
-    covered, near = np.asarray(drawn.covered), binary_dilation(mask)
-    return float((covered & ~near).sum() / max(covered.sum(), 1))
-
-
-def _judge(name, drawn, mask) -> ViewCheck:
-    inside, before, height = float(drawn.inside), float(drawn.before), float(drawn.height)
-    iou = None if mask is None else _iou(drawn, mask)
-    outside = None if mask is None else _outside(drawn, mask)
-    warnings = []
-    if before == 0:
-        warnings.append("the body is behind the camera")
-    elif before < 1:
-        warnings.append(f"{1 - before:.0%} of the body is behind the camera")
-    elif inside < LEAST_INSIDE:
-        warnings.append(f"{1 - inside:.0%} of the body is outside the frame")
-    elif height < LEAST_HEIGHT:
-        warnings.append(f"the body is {height:.1%} of the image's height: are all lengths in metres?")
-    if mask is not None and not mask.any():
-        warnings.append("the mask is empty")
-    elif iou is not None and iou < LEAST_IOU:
-        warnings.append(f"body and mask do not agree (IoU {iou:.2f})")
-    return ViewCheck(name, iou, outside, inside, tuple(warnings))
-
-
-def _mistake_in_image(drawn, mask):
-    """An inverted mask, or a mirrored photo."""
-    if mask is None or not mask.any():
-        return None
-    covered = np.asarray(drawn.covered)
-    tried = {"the mask is inverted": (covered, ~mask), "the photo is mirrored": (covered[:, ::-1], mask)}
-    shares = {mistake: (a & b).sum() / max((a | b).sum(), 1) for mistake, (a, b) in tried.items()}
-    best = max(shares, key=lambda mistake: shares[mistake])
-    return best if shares[best] > SURELY_IOU else None
-
-
-def _mistake_in_space(draw, camera, translation, mask):
-    """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in frame."""
-    fitting: dict[str, float] = {}
-    for mistake, undo in MISTAKES.items():
-        matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world, float), translation), camera.K.dtype)
-        view = _judge("", draw(replace(camera, cam_from_world=matrix)), mask)
-        if not view.warnings and view.inside > SURELY_INSIDE:
-            fitting[mistake] = view.iou or 0.0
-    if mask is None:
-        return next(iter(fitting)) if len(fitting) == 1 else None
-    return max(fitting, key=lambda mistake: fitting[mistake]) if fitting else None
-
-
-def _boundary(covered):
+def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels of the body beside pixels outside it."""
-    padded = np.pad(covered, 1, mode="edge")
-    neighbours = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
-    return covered & ~np.logical_and.reduce(neighbours)
+    return covered & ~binary_erosion(covered, border_value=1)
 
 
 def _label(view: ViewCheck) -> str:
     iou = "" if view.iou is None else f"  IoU {view.iou:.2f}"
     return f"{'! ' if view.warnings else ''}{view.name}{iou}"
+
+
+# Fits -----------------------------------------------------------------------------------------------------------------
+
+VIEWS = 24
+"""Most views on a sheet."""
+FINE = 2
+"""Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
+RADIUS, SMALL = 4, 2
+"""Radii of discs on the body, and on hands and face, pixels of a tile."""
+WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
+TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 60, 10, 22
+"""Height of the plot's letters: a share of its width, within limits, pixels."""
+LINES = 10
+"""The plot's height in letters."""
+
+
+def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path) -> None:
+    """Write a sheet of up to 24 views, evenly chosen, as a PNG; below it the error over time if there are several frames.
+
+    Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot be written.
+    """
+    count = capture.view_count
+    chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
+    drawn = [_with_keypoints(_overlay(capture, view), capture, keypoints, examination, view) for view in chosen]
+    sheet = tile(np.stack(drawn), labels=[_fit_label(examination, view) for view in chosen])
+    if len(examination.frames) > 1:
+        sheet = np.concatenate([sheet, plot_over_time(examination.frames, sheet.shape[1])])
+    write_png(out, sheet)
+
+
+def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndarray, "height width 3"]:
+    """A plot of the median error of each of at least two frames, pixels; NaN leaves a gap."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    text = int(np.clip(width * TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT))
+    plot = Image.new("RGB", (width, LINES * text), WHITE)
+    pen, font = ImageDraw.Draw(plot), ImageFont.load_default(text)
+    left, right, top, bottom = 3 * text, width - 2 * text, 2 * text, (LINES - 2) * text
+    finite = errors[np.isfinite(errors)]
+    highest = 1.05 * float(finite.max(initial=0.0)) or 1.0
+    x = lambda frame: left + (right - left) * frame / (len(errors) - 1)
+    y = lambda error: bottom - (bottom - top) * error / highest
+    for tick in _ticks(highest, 4):
+        pen.line([(left, y(tick)), (right, y(tick))], fill=(225, 225, 225))
+        pen.text((left - 6, y(tick)), f"{tick:g}", fill=BLACK, font=font, anchor="rm")
+    for tick in _ticks(len(errors) - 1, width / (6 * text), whole=True):
+        pen.line([(x(tick), bottom), (x(tick), bottom + 4)], fill=BLACK)
+        pen.text((x(tick), bottom + 6), f"{tick:g}", fill=BLACK, font=font, anchor="mt")
+    pen.line([(left, top), (left, bottom), (right, bottom)], fill=BLACK)
+    pen.text((left, top - 6), "median error of each frame, pixels", fill=BLACK, font=font, anchor="lb")
+    points = [(x(i), y(error)) if np.isfinite(error) else None for i, error in enumerate(errors)]
+    color = tuple(to_uint8(np.asarray(LEFT)).tolist())
+    for a, b in itertools.pairwise(points):
+        if a and b:
+            pen.line([a, b], fill=color, width=2)
+    for point in points:
+        if point:
+            pen.circle(point, 2, fill=color)
+    return np.asarray(plot) / 255
+
+
+def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
+    """The body over a photo, its longest side as long as that of any tile."""
+    shown = capture.select([view]).resized(LONGEST_SIDE)
+    pose = capture.pose(int(capture.frames[view]))
+    return draw_body(capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0])[0]
+
+
+def _with_keypoints(
+    image: Float[np.ndarray, "h w 3"], capture: Capture, keypoints: Keypoints, examination: Examination, view: int
+) -> Float[np.ndarray, "h w 3"]:
+    """An image with discs, crosses, and the lines between them."""
+    from PIL import Image, ImageDraw
+
+    height, width = image.shape[:2]
+    canvas = Image.fromarray(to_uint8(image)).resize((FINE * width, FINE * height), Image.Resampling.BILINEAR)
+    pen = ImageDraw.Draw(canvas)
+    scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
+    within = lambda points: np.clip(points * scale, -FINE * width, 2 * FINE * width)
+    discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
+    shown = np.flatnonzero(examination.compared[view])
+    radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
+    for k in shown:
+        (x, y), arm = crosses[k], 1.5 * radii[k]
+        for line in (
+            [tuple(discs[k]), (x, y)],
+            [(x - arm, y - arm), (x + arm, y + arm)],
+            [(x - arm, y + arm), (x + arm, y - arm)],
+        ):
+            pen.line(line, fill=CROSS, width=FINE)
+    for k in shown:
+        color, outlier = _color(keypoints.set.names[k]), examination.outliers[view, k]
+        pen.circle(tuple(discs[k]), radii[k] + FINE, fill=None if outlier else color, outline=BLACK, width=FINE)
+        if outlier:
+            pen.circle(tuple(discs[k]), radii[k], outline=color, width=FINE)
+    return np.asarray(canvas.resize((width, height), Image.Resampling.BOX)) / 255
+
+
+def _is_small(name: str) -> bool:
+    return name.startswith("face_") or any(
+        part in name for part in ("hand_root", *(f"_{finger}_" for finger in FINGERS))
+    )
+
+
+def _color(name: str) -> tuple[int, ...]:
+    side = {"left": LEFT, "right": RIGHT}.get(name.split("_")[0])
+    return WHITE if side is None else tuple(to_uint8(np.asarray(side)).tolist())
+
+
+def _fit_label(examination: Examination, view: int) -> str:
+    fit = examination.report.views[view]
+    return f"{fit.name}  {f'{fit.median:.1f} px' if fit.keypoints else 'no keypoints'}"
+
+
+def _ticks(highest: float, count: float, whole: bool = False) -> Float[np.ndarray, " n"]:
+    """Round numbers from 0 to `highest`, about `count`."""
+    rough = highest / count
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = power * next(x for x in (1, 2, 5, 10) if x * power >= rough * (1 - 1e-9))
+    return np.arange(0, highest * (1 + 1e-9), max(step, 1.0) if whole else step)
+
+
+# Ranges of use ---------------------------------------------------------------------------------------------------------
+
+LIMITS = "assets/limits.json"
+PHOTO_SIZE = 256
+"""Side of the photos that the ranges were measured with, pixels, which is what the shipped weights take."""
+
+
+def load_limits() -> dict[str, Any]:
+    """{"bound": dB, "ranges": {quantity: {"unit", "low", "high"}}}; an end that was never reached is None."""
+    return json.loads(resources.files("humangs_jax").joinpath(LIMITS).read_text())
+
+
+def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
+    """(least, most) over the views of what a capture itself shows: photos, camera distance in metres, height of the person in
+    pixels of a photo that is reduced to `PHOTO_SIZE`.
+    """
+    frames = np.asarray(capture.frames)
+    centers = np.asarray(capture.cameras.center, float)
+    pelvis = np.asarray(capture.body.joint_regressor)[0] @ np.asarray(capture.body.template)
+    distances = np.linalg.norm(centers - (np.asarray(capture.poses.translation, float)[frames] + pelvis), axis=-1)
+    found = {
+        "photos": (float(capture.view_count), float(capture.view_count)),
+        "distance of the cameras": (float(distances.min()), float(distances.max())),
+    }
+    if capture.masks is not None:
+        scale = PHOTO_SIZE / max(capture.masks.shape[1:])  # the network reduces larger photos
+        heights = [float(np.ptp(person_box(mask > MASK_THRESHOLD)[0])) * scale for mask in capture.masks]
+        found["height of the person"] = (min(heights), max(heights))
+    return found
+
+
+def limits_table(capture: Capture) -> str:
+    """A line a quantity: the range, what this capture has, and a mark where that lies outside."""
+    limits, own = load_limits(), quantities(capture)
+    lines = [f"ranges in which avatars lose less than {limits['bound']:g} dB, each alone (docs/stability.md):"]
+    width = max(len(name) for name in limits["ranges"])
+    for name, row in limits["ranges"].items():
+        low, high = row["low"], row["high"]
+        wanted = _range(low, high, row["unit"])
+        has = ""
+        if name in own:
+            least, most = own[name]
+            outside = (low is not None and least < low) or (high is not None and most > high)
+            has = f"here {_range(least, most, row['unit'])}{'  !' * outside}"
+        lines.append(f"{name:<{width}}  {wanted:<27}{has}".rstrip())
+    return "\n".join(lines)
+
+
+def _range(low: float | None, high: float | None, unit: str) -> str:
+    if low is None and high is None:
+        return "any that was tried"
+    if low == high:
+        return f"{low:.3g} {unit}".strip()
+    if low is None:
+        return f"up to {high:.3g} {unit}".strip()
+    return f"{low:.3g} {unit} or more".replace("  ", " ") if high is None else f"{low:.3g} to {high:.3g} {unit}".strip()

@@ -22,7 +22,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, seen_person, write_people
+from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks

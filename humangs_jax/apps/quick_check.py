@@ -1,64 +1,101 @@
-"""Whether the photos, masks, cameras and poses of a capture belong together, in a fraction of a second.
+"""What is wrong with a capture: whether its photos, masks, cameras and poses belong together, in a fraction of a second.
 
-The posed body is drawn as points into coarse silhouettes by numpy: nothing is compiled. Silhouettes that are not where the masks
-are get explained by the mistakes that people make. `humangs reconstruct` and `refine` look first; `check` draws the whole sheet.
+The posed body is drawn as points into coarse silhouettes by numpy: nothing is compiled. Where a silhouette is not on its mask,
+mistakes that people make are undone on trial, and the one that explains it is named. `humangs reconstruct` and `refine` look
+first; `humangs check` and `start` draw a sheet as well (`apps.check`).
 """
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.calibration.calibration import (
+    CAM_FROM_WORLD_OPENGL,
+    CONVENTIONS,
+    ROTATION_TO_Y_UP,
+    WORLD_FROM_CAM,
+    WORLD_FROM_CAM_OPENGL,
+    pose_matrix,
+)
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.surface_points import points_in_image, surface_points
+from humangs_jax.data.capture_checks import few
+from humangs_jax.data.usable_views import points_in_image, surface_points
 
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
 SURELY_IOU = 0.6
 """From here on a mistake that was undone explains a view."""
 LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
-"""Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
+"""Share of the points in the frame: below the first it is a warning, the second is asked of an explanation."""
+LEAST_HEIGHT = 0.05
+"""Share of the image's height: a body smaller than this has its lengths in another unit."""
 GRID = 64
 """Cells of a silhouette along the longer side of the image."""
 POINTS = 6000
 """On the surface of the body: several for each cell that it covers."""
 VIEWS = 24
-"""Most views that are looked at, evenly chosen."""
+"""Most views that are looked at before a reconstruction, evenly chosen."""
 LONGEST_TURN = 2 * math.pi + 0.5
 """Radians: rotation vectors are at most half a turn, and a whole one where someone counted on; degrees are far beyond."""
 BETTER = 0.1
 """IoU by which an exchange has to explain each view better than the capture does."""
 DARKEST, BURNT = 0.12, 0.98
 """A photo is too dark if 98 % of the person's values are below the first, and burnt out if 60 % are above the second."""
-NAMED = 4
-"""Views that are named in a warning; the others are counted."""
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Points of a y-up world -> points of a z-up world."""
-
-
-def _moved(offset):
-    return np.block([[np.eye(3), np.reshape(offset, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
-
-
-MISTAKES = {
-    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
+Matrix = Float[np.ndarray, "4 4"]
+Cells = Bool[np.ndarray, "rows columns"]
+_TO_Y_UP = pose_matrix(np.asarray(ROTATION_TO_Y_UP["+z"], float), np.zeros(3))
+MISTAKES: dict[str, Callable[[Matrix, Float[np.ndarray, "3"]], Matrix]] = {
+    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: CONVENTIONS[WORLD_FROM_CAM](m),
     "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
-        lambda m, t: _FLIP @ m
+        lambda m, t: CONVENTIONS[CAM_FROM_WORLD_OPENGL](m)
     ),
     "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
-        lambda m, t: _FLIP @ np.linalg.inv(m)
+        lambda m, t: CONVENTIONS[WORLD_FROM_CAM_OPENGL](m)
     ),
-    "the camera's translation is in millimetres": lambda m, t: np.block([[m[:3, :3], m[:3, 3:] / 1000], [m[3:]]]),
-    "the body's translation is in millimetres": lambda m, t: m @ _moved(t / 1000 - t),
+    "the camera's translation is in millimetres": lambda m, t: pose_matrix(m[:3, :3], m[:3, 3] / 1000),
+    "the body's translation is in millimetres": lambda m, t: m @ pose_matrix(np.eye(3), t / 1000 - t),
     "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
-        lambda m, t: m @ _FROM_Y_UP
+        lambda m, t: m @ _TO_Y_UP.T
     ),
 }
-"""Usual mistakes, and the correct cam_from_world from the given one and the body's translation."""
+"""What people do wrong, and the correct cam_from_world from the given one and the body's translation."""
+MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
+    "the mask is inverted": lambda body, mask: (body, ~mask),
+    "the photo is mirrored": lambda body, mask: (body[:, ::-1], mask),
+}
+"""The same for silhouettes of body and mask."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewFault:
+    """What is wrong with a view."""
+
+    problem: str | None
+    """A line; None: nothing."""
+    inside: float
+    """Share of the body in the frame."""
+
+
+def likely_mistakes(capture: Capture) -> tuple[str, ...]:
+    """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
+    views = _Views.of(capture, VIEWS)
+    whole, explained = _faults_of_all(views)
+    found: dict[str, list[str]] = {}
+    for i, name in enumerate(views.names):
+        if i not in explained and (problem := _fault(views, i).problem):
+            found.setdefault(problem, []).append(name)
+    return (*whole, *(f"{problem}: view {few(names)}" for problem, names in found.items()))
+
+
+def faults(capture: Capture) -> tuple[tuple[str, ...], tuple[ViewFault, ...]]:
+    """What is wrong with a capture as a whole, a line each, and with every view."""
+    views = _Views.of(capture, capture.view_count)
+    of_each = tuple(_fault(views, i) for i in range(capture.view_count))
+    return (_faults_of_all(views)[0] if any(each.problem for each in of_each) else ()), of_each
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,54 +118,42 @@ class _Views:
     height: int
     largest: float
 
-
-def likely_mistakes(capture: Capture) -> tuple[str, ...]:
-    """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
-    views = _views(capture)
-    whole, explained = _whole_capture(views)
-    return (*whole, *_single_views(views, explained))
-
-
-def whole_capture_mistakes(capture: Capture) -> tuple[str, ...]:
-    """Mistakes that no view shows by itself: poses in degrees, cameras of other views."""
-    return _whole_capture(_views(capture))[0]
-
-
-def _views(capture) -> _Views:
-    chosen = np.unique(
-        np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int)
-    ).tolist()
-    rotations = np.asarray(capture.poses.rotations, float)
-    translations = np.asarray(capture.poses.translation, float)
-    frames, masks = [int(capture.frames[i]) for i in chosen], capture.masks
-    return _Views(
-        names=tuple(capture.names[i] for i in chosen),
-        frames=frames,
-        points=surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS),
-        masks=None if masks is None else [_mask_cells(np.asarray(masks[i])) for i in chosen],
-        exposures=[_exposure(capture.images[i], None if masks is None else masks[i]) for i in chosen],
-        K=np.asarray(capture.cameras.K, float)[chosen],
-        cam_from_world=np.asarray(capture.cameras.cam_from_world, float)[chosen],
-        translations=translations,
-        width=capture.cameras.width,
-        height=capture.cameras.height,
-        largest=float(np.linalg.norm(rotations, axis=-1).max()),
-    )
+    @classmethod
+    def of(cls, capture: Capture, most: int) -> "_Views":
+        """At most so many views, evenly chosen."""
+        chosen = np.unique(
+            np.linspace(0, capture.view_count - 1, min(capture.view_count, most)).round().astype(int)
+        ).tolist()
+        rotations = np.asarray(capture.poses.rotations, float)
+        translations = np.asarray(capture.poses.translation, float)
+        frames, masks = [int(capture.frames[i]) for i in chosen], capture.masks
+        return cls(
+            names=tuple(capture.names[i] for i in chosen),
+            frames=frames,
+            points=surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS),
+            masks=None if masks is None else [_mask_cells(np.asarray(masks[i])) for i in chosen],
+            exposures=[_exposure(capture.images[i], None if masks is None else masks[i]) for i in chosen],
+            K=np.asarray(capture.cameras.K, float)[chosen],
+            cam_from_world=np.asarray(capture.cameras.cam_from_world, float)[chosen],
+            translations=translations,
+            width=capture.cameras.width,
+            height=capture.cameras.height,
+            largest=float(np.linalg.norm(rotations, axis=-1).max()),
+        )
 
 
-def _whole_capture(views):
-    """The mistakes, and the views that they explain."""
+def _faults_of_all(views: _Views) -> tuple[tuple[str, ...], set[int]]:
+    """Mistakes that no view shows by itself, and the views that they explain."""
     if views.largest > LONGEST_TURN:
         degrees = f"the poses seem to be in degrees: rotations up to {views.largest:.0f}, expected radians"
         return (degrees,), set(range(len(views.names)))
-    exchanged = _exchanged_cameras(views)
-    if not exchanged:
+    if not (exchanged := _exchanged_cameras(views)):
         return (), set()
     pairs = [f"{views.names[i]} by the camera of {views.names[j]}" for i, j in exchanged.items()]
-    return (f"cameras are exchanged: the body would fit {_listed(pairs)}",), set(exchanged)
+    return (f"cameras are exchanged: the body would fit {few(pairs)}",), set(exchanged)
 
 
-def _exposure(image, mask) -> str | None:
+def _exposure(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"] | None) -> str | None:
     """What is wrong with a photo on which the person is nearly black or burnt out: nothing is to be seen there."""
     person = image if mask is None else image[mask > 0.99]  # without its blended edge
     if person.size and np.quantile(person, 0.98) < DARKEST:
@@ -138,7 +163,7 @@ def _exposure(image, mask) -> str | None:
     return None
 
 
-def _exchanged_cameras(views) -> dict[int, int]:
+def _exchanged_cameras(views: _Views) -> dict[int, int]:
     """For views that fit the camera of another one: that one. An exchange has to explain all of its views."""
     if views.masks is None:
         return {}
@@ -159,40 +184,36 @@ def _exchanged_cameras(views) -> dict[int, int]:
     return {i: j for i, (j, _) in found.items()}
 
 
-def _single_views(views, explained) -> Iterator[str]:
-    """One warning for each cause, naming its views."""
-    found: dict[str, list[str]] = {}
-    for i, name in enumerate(views.names):
-        if i not in explained and (problem := _problem(views, i)):
-            found.setdefault(problem, []).append(name)
-    for problem, names in found.items():
-        yield f"{problem}: view {_listed(names)}"
-
-
-def _problem(views, i):
-    """What is wrong with a view, None if nothing is to be seen."""
-    covered, inside = _silhouette(views, i)
+def _fault(views: _Views, i: int) -> ViewFault:
+    """What is wrong with one view."""
+    body, inside, height = _silhouette(views, i)
     mask = None if views.masks is None else views.masks[i]
+    own = None if mask is None else _overlap(body, mask)
     if mask is not None and not mask.any():
-        return "the mask is empty"
-    own = None if mask is None else _overlap(covered, mask)
-    if inside >= LEAST_INSIDE and (own is None or own >= LEAST_IOU):
-        return views.exposures[i]
-    told = "most of the body is outside the frame" if own is None else "body and mask do not agree"
-    cause = _cause(views, i, covered, mask)
-    return told if cause is None else f"{told}; they would if {cause}"
+        return ViewFault("the mask is empty", inside)
+    if inside < LEAST_INSIDE:
+        problem = (
+            "most of the body is outside the frame" if inside else "the body is behind the camera or outside the frame"
+        )
+    elif height < LEAST_HEIGHT:
+        problem = "the body is tiny, in metres it would not be"
+    elif own is not None and own < LEAST_IOU:
+        problem = "body and mask do not agree"
+    else:
+        return ViewFault(views.exposures[i], inside)
+    cause = _cause(views, i, body, mask)
+    return ViewFault(problem if cause is None else f"{problem}; it would fit if {cause}", inside)
 
 
-def _cause(views, i, covered, mask):
-    """The mistake that, undone, explains a view."""
+def _cause(views: _Views, i: int, body: Cells, mask: Cells | None) -> str | None:
+    """The mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in the frame."""
     tried = {}
     if mask is not None:
-        tried["the mask is inverted"] = _overlap(covered, ~mask)
-        tried["the photo is mirrored"] = _overlap(covered[:, ::-1], mask)
+        tried = {mistake: _overlap(*undo(body, mask)) for mistake, undo in MISTAKES_OF_IMAGES.items()}
     for mistake, undo in MISTAKES.items():
         matrix = undo(views.cam_from_world[i], views.translations[views.frames[i]])
-        drawn, inside = _silhouette(views, i, matrix=matrix)
-        if inside > SURELY_INSIDE:
+        drawn, inside, height = _silhouette(views, i, matrix=matrix)
+        if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
             tried[mistake] = 1.0 if mask is None else _overlap(drawn, mask)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
     if best is None or tried[best] <= SURELY_IOU or (mask is None and len(tried) > 1):
@@ -203,8 +224,10 @@ def _cause(views, i, covered, mask):
 # Coarse silhouettes ---------------------------------------------------------------------------------------------------
 
 
-def _silhouette(views, i, camera=None, matrix=None) -> tuple[Bool[np.ndarray, "rows columns"], float]:
-    """The cells that the body of view i covers, and the share of its points in the image.
+def _silhouette(
+    views: _Views, i: int, camera: int | None = None, matrix: Matrix | None = None
+) -> tuple[Cells, float, float]:
+    """The cells that the body of view i covers; the share of its points in the image; and its height there, of the image's.
 
     Arguments: camera: of which view, None: its own. matrix: in place of that camera's.
     """
@@ -212,45 +235,36 @@ def _silhouette(views, i, camera=None, matrix=None) -> tuple[Bool[np.ndarray, "r
     matrix = views.cam_from_world[camera] if matrix is None else matrix
     points = views.points[views.frames[i]]
     pixels = points_in_image(points, views.K[camera], matrix, views.width, views.height)
-    shape, cell = _shape(views.width, views.height), _cell(views.width, views.height)
+    shape, cell = _grid(views.width, views.height)
     covered = np.zeros(shape, bool)
     column, row = np.minimum((pixels / cell).astype(int), np.asarray(shape[::-1]) - 1).T
     covered[row, column] = True
-    return _closed(covered), len(pixels) / len(points)
+    height = float(np.ptp(pixels[:, 1])) / views.height if len(pixels) else 0.0
+    return _closed(covered), len(pixels) / len(points), height
 
 
-def _closed(cells):
+def _closed(cells: Cells) -> Cells:
     """Without the gaps of one cell between the points of a surface: dilated, then eroded."""
-    wide = np.pad(cells, 2)
-    grown = np.logical_or.reduce([np.roll(wide, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)])
-    closed = np.logical_and.reduce([np.roll(grown, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)])
-    return closed[2:-2, 2:-2]
+    shifted = lambda x: [np.roll(x, (row, column), (0, 1)) for row in (-1, 0, 1) for column in (-1, 0, 1)]
+    grown = np.logical_or.reduce(shifted(np.pad(cells, 2)))
+    return np.logical_and.reduce(shifted(grown))[2:-2, 2:-2]
 
 
-def _mask_cells(mask) -> Bool[np.ndarray, "rows columns"]:
+def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:
     """The cells whose centres the mask has."""
     height, width = mask.shape
-    rows, columns = _shape(width, height)
-    cell = _cell(width, height)
+    (rows, columns), cell = _grid(width, height)
     at = lambda count, most: np.minimum(((np.arange(count) + 0.5) * cell).astype(int), most - 1)
     return mask[at(rows, height)][:, at(columns, width)] > 0.5
 
 
-def _cell(width, height):
-    """Side of a cell in pixels."""
-    return max(width, height) / GRID
+def _grid(width: int, height: int) -> tuple[tuple[int, int], float]:
+    """Rows and columns of cells, and the side of one in pixels."""
+    cell = max(width, height) / GRID
+    return (max(1, round(height / cell)), max(1, round(width / cell))), cell
 
 
-def _shape(width, height):
-    cell = _cell(width, height)
-    return max(1, round(height / cell)), max(1, round(width / cell))
-
-
-def _overlap(a, b):
+def _overlap(a: Cells, b: Cells) -> float:
+    """Intersection over union."""
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 0.0
-
-
-def _listed(names):
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

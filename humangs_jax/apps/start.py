@@ -7,22 +7,18 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from humangs_jax.data.calibration.formats import EASYMOCAP_FILES, FILES
 from humangs_jax.data.calibration.photos import SUFFIXES, is_photo
 from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 from humangs_jax.io.images import image_size, open_image
 from humangs_jax.io.reading import reading, walk
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
-COLMAP_FILES = ("images.txt", "cameras.txt", "images.bin")
-KEYPOINT_FILES = (
-    *("keypoints", "keypoints.json", "keypoints.npz", "openpose", "rtmpose", "mmpose", "predictions"),
-    *("alphapose-results.json", "alphapose.json"),
-)
-"""Names that are looked for in the folder of photos, in this order."""
+"""Names that are looked for in the folder of photos, in this order; those of files: `data.formats`."""
+KEYPOINT_FOLDER = "keypoints"
 OWN_DETECTOR = ("pip install 'humangs_jax[photos]', and the same command finds them; or with another program:",)
 """For masks and keypoints: said where LiteRT is not installed."""
 
@@ -83,17 +79,18 @@ def look(
         if path is not None and not path.exists():
             raise CaptureError(path, "", "no such file or folder")
     images, photos = photo_files(folder)
-    named = (folder / name for name in KEYPOINT_FILES)
+    named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
+    named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
     others = sorted(path for path in folder.glob("*keypoint*") if path.suffix in ("", ".json", ".npz"))
     return Material(
         folder=folder,
         images=images,
         photos=len(photos),
         size=image_size(photos[0]),
-        cameras=cameras or next((place for name in CAMERA_PLACES if _has_cameras(place := folder / name)), None),
+        cameras=cameras or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
         masks=masks or next((place for name in MASK_FOLDERS if any(find_photos(place := folder / name))), None),
         alpha=_has_alpha(photos[0]),
-        keypoints=keypoints or next((path for path in (*named, *others) if path.exists()), None),
+        keypoints=keypoints or next(iter([*named, *others]), None),
     )
 
 
@@ -173,18 +170,11 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
 
 def find_photos(folder: Path) -> Iterator[Path]:
     """The photos of a folder and of those in it, except for masks, captures, and what other programs have made of photos."""
-    others = (*MASK_FOLDERS, *KEYPOINT_FILES, "colmap")
+    others = (*MASK_FOLDERS, KEYPOINT_FOLDER, *(name for each in KEYPOINTS.values() for name in each.files), "colmap")
     if folder.is_dir():
         with reading(folder, "folder of photos", CaptureError):
             found = walk(folder, lambda path: path.name in others or (path / "capture.json").exists())
             yield from filter(is_photo, found)
-
-
-def _has_cameras(place):
-    """Whether a calibration with one of the usual names is there (`calibration.formats`)."""
-    models = (place, place / "sparse" / "0", place / "sparse")
-    colmap = any((model / name).is_file() for model in models for name in COLMAP_FILES)
-    return colmap or any((place / name).is_file() for name in (*EASYMOCAP_FILES, *FILES))
 
 
 def _has_alpha(photo):

@@ -4,9 +4,16 @@ import dataclasses
 from pathlib import Path
 
 from humangs_jax.apps.start import find_photos
-from humangs_jax.data.calibration.frame_choice import LONGER_SIDE, PHOTOS, choose_frames, looked_at
+from humangs_jax.data.calibration.videos import (
+    LONGER_SIDE,
+    PHOTOS,
+    choose_frames,
+    find_videos,
+    grey_frames,
+    looked_at,
+    write_frames,
+)
 from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
-from humangs_jax.data.calibration.videos import find_videos, grey_frames, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import read_json, reading, write_json

@@ -3,12 +3,13 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.data.formats import CAMERAS
 
 if TYPE_CHECKING:
     from humangs_jax.apps.detect import PhotoPeople
@@ -87,15 +88,14 @@ SIZES = (128, 256, 512)
 
 @dataclasses.dataclass(frozen=True)
 class ImportCameras:
-    """Make a capture folder from calibrated cameras: COLMAP text, OpenCV YAML or JSON, calibration_full.json, transforms.json.
+    """Make a capture folder from photos and the calibration of their cameras; then `humangs fit` finds the body.
 
-    Then `humangs fit` finds the body. Conventions of every format: docs/cameras.md.
+    Conventions of every format: docs/cameras.md.
     """
 
     what: Positional[Literal["cameras"]]
     """"cameras"."""
-    source: Positional[Path]
-    """File or folder with the calibration; its format is detected."""
+    source: Annotated[Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")]
     images: Path
     """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same moment)."""
     out: Path

@@ -5,9 +5,9 @@ Everything is checked before the work begins, and written after it.
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.captures import found_here, tell_found
 from humangs_jax.cli.options import (
@@ -20,14 +20,16 @@ from humangs_jax.cli.options import (
     tell_deleted,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.data.formats import KEYPOINTS
 
 
 @dataclasses.dataclass(frozen=True)
 class Detections:
     """2D keypoints of a detector."""
 
-    keypoints: Path | None = None
-    """Keypoint file or folder of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose (docs/fitting.md)."""
+    keypoints: Annotated[Path | None, arg(help=f"Keypoint file or folder (docs/fitting.md): {KEYPOINTS.listed()}.")] = (
+        None
+    )
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
@@ -295,14 +297,14 @@ class Check:
             report = check_capture(capture, self.out, record.keypoints if same else keypoints)
         tell(report)
         if self.limits:
-            from humangs_jax.apps.limits import limits_table
+            from humangs_jax.apps.check import limits_table
 
             tell(limits_table(capture))
         wrote(self.out, "the body over the photos")
         ok = report.ok
         if record is not None or keypoints is not None:
             with stage("examining the fit"):
-                from humangs_jax.apps.fit_sheet import fit_sheet
+                from humangs_jax.apps.check import fit_sheet
                 from humangs_jax.fitting.examination import examine_record
 
                 examination, keypoints = examine_record(capture, record, keypoints)

@@ -3,9 +3,9 @@
 import dataclasses
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from humangs_jax.cli.captures import tell_found
 from humangs_jax.cli.options import (
@@ -17,6 +17,7 @@ from humangs_jax.cli.options import (
     tell_deleted,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 
 if TYPE_CHECKING:
     from humangs_jax.apps.held_out import HeldOut
@@ -41,12 +42,10 @@ class Start:
     a video, or a folder with one: its best frames become the photos in OUT_photos, where the rest is looked for."""
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
-    cameras: Path | None = None
-    """Calibration, if it is elsewhere; formats: docs/cameras.md."""
+    cameras: Annotated[Path | None, arg(help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}.")] = None
     masks: Path | None = None
     """Folder of the masks, if it is elsewhere."""
-    keypoints: Path | None = None
-    """Keypoint file or folder, if it is elsewhere; formats: docs/fitting.md."""
+    keypoints: Annotated[Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")] = None
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
     height: float | None = None

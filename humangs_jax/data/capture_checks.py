@@ -1,5 +1,6 @@
 """Values of capture, camera and keypoint files, checked one by one; every fault is a `CaptureError` of one line."""
 
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io import arrays
 from humangs_jax.io.atomic import check_replaceable
 from humangs_jax.io.reading import FileError, parse_json, read_text, reading, shown
 
@@ -60,35 +62,52 @@ def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "
     return mapping[key]
 
 
+KINDS: dict[type, str] = {
+    dict: "a JSON object",
+    list: "a list",
+    str: "a name or path",
+    int: "an integer",
+    float: "a number",
+}
+"""Of JSON values, in words."""
+
+
+def expect(value: Any, kind: type, file: object, field: str) -> Any:
+    """A JSON value, of one of `KINDS`; names are not empty."""
+    if not isinstance(value, int | float if kind is float else kind) or isinstance(value, bool) or value == "":
+        raise CaptureError(file, field, f"expected {KINDS[kind]}, got {shown(value)}")
+    return value
+
+
+def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list[Any]:
+    """The members of a JSON object with these names, each of its kind."""
+    expect(value, dict, file, field)
+    prefix = f"{field}." if field else ""
+    return [expect(required(value, key, file, prefix), kind, file, f"{prefix}{key}") for key, kind in kinds.items()]
+
+
+def few(names: Sequence[str], most: int = 4) -> str:
+    """Names for an error or a warning; beyond so many they are counted."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
 # Numbers -------------------------------------------------------------------------------------------------------------
 
 
-def numbers(value: Any, file: object, field: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """Finite float32 numbers of a shape."""
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
-            raise TypeError
-        with np.errstate(over="ignore"):  # looked at below
-            array = array.astype(np.float32)
-    except (ValueError, TypeError, OverflowError):
-        wanted = "numbers" if shape is None else f"{' x '.join(map(str, shape))} numbers"
-        raise CaptureError(file, field, f"expected {wanted}") from None
-    if shape is not None and array.shape != shape:
-        raise CaptureError(file, field, f"expected shape {shape}, got {array.shape}")
-    if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise CaptureError(file, field, f"expected finite numbers, got {array[where]} at index {list(where)}")
-    return array
+file_numbers = functools.partial(arrays.numbers, error=CaptureError)
+"""Float64 numbers of a file, see `io.arrays.numbers`."""
+numbers = functools.partial(file_numbers, dtype=np.float32)
+"""Float32 numbers."""
 
 
 def floats(value: Any, file: object, field: str, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
     """Finite float64 numbers, however nested, reshaped to `shape` in row-major order."""
-    array = numbers(value, file, field)
+    array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
         wanted = " x ".join(map(str, shape)) or "one"
         raise CaptureError(file, field, f"expected {wanted} numbers, got shape {array.shape}")
-    return np.asarray(value, np.float64).reshape(shape)
+    return array.reshape(shape)
 
 
 def check_range(array: np.ndarray, file: object, field: str) -> None:

@@ -1,10 +1,155 @@
-"""What is read: motions and data sets. A row each; a new format is a file with its reader and a line here."""
+"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a file with its reader and a line here.
+
+`--help`, `humangs start`, errors and the tables in the docs are made of these rows.
+"""
 
 import dataclasses
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
-from humangs_jax.core.registry import FOLDER, Format, Formats
+from humangs_jax.core.registry import FOLDER, Format, Formats, imported
+
+# Cameras and keypoints --------------------------------------------------------------------------------------------------
+# The module of a row has two functions; where several recognize a file, the first one reads it.
+#     recognizes(source) -> bool            whether the content of a file is of this format; not asked where `folder` is set
+#     read(source, format) -> Calibration   or Detections; source: `calibration.Source`, `keypoints.keypoints.Source`
+
+F = TypeVar("F", bound="SourceFormat")
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceFormat(Format):
+    """A format whose files have usual names, but are known by their content. Its code is "module:read"."""
+
+    files: tuple[str, ...] = ()
+    """Usual names in a folder, patterns of `Path.glob`."""
+    content: str = ""
+    """What is in them, for the docs: a line of Markdown."""
+    folder: bool = False
+    """Whether the files of one folder are read together."""
+
+    def __str__(self) -> str:
+        """As lists name it."""
+        return self.about
+
+    def fits(self, source: Any) -> bool:
+        """Whether a source, a file, is of this format."""
+        return not self.folder and imported(str(self.code).replace(":read", ":recognizes"))(source)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Usual names of files, without folders."""
+        return tuple(dict.fromkeys(Path(file).name for file in self.files))
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraFormat(SourceFormat):
+    """A format of calibrations."""
+
+    up: str = "-y"
+    """The axis that points up."""
+    pixel_centers: Literal["integer", "half"] = "integer"
+    """Where the centre of the first pixel is: at (0, 0) or at (0.5, 0.5)."""
+    per_image: bool = False
+    """Whether it has one camera for each image, not one for each camera."""
+
+    def __str__(self) -> str:
+        return f"{self.about} ({', '.join(self.names)})" if self.files else self.about
+
+
+class SourceFormats(Formats[F]):
+    """Formats that are known by the content of their files."""
+
+    def found(self, folder: Path) -> tuple[F, Path] | None:
+        """The first format of which a folder has files, and the first of these; None: none."""
+        for each in self.values():
+            for pattern in each.files:
+                if (file := next(iter(sorted(folder.glob(pattern))), None)) is not None:
+                    return each, file
+        return None
+
+    def of_name(self, file: Path) -> F | None:
+        """The first format of several files that one is of by its name."""
+        named = (each for each in self.values() if each.folder and any(fnmatch(file.name, name) for name in each.names))
+        return next(named, None)
+
+    def of_content(self, source: Any) -> F | None:
+        """The first format that recognizes a source, a file."""
+        return next((each for each in self.values() if each.fits(source)), None)
+
+    def listed(self) -> str:
+        """All in one line."""
+        return "; ".join(map(str, self.values()))
+
+
+_CAMERAS, _KEYPOINTS = "humangs_jax.data.calibration.", "humangs_jax.data.keypoints."
+_MODELS = ("", "sparse/0/", "sparse/")
+CAMERAS = SourceFormats(
+    colmap=CameraFormat(
+        "COLMAP text model",
+        _CAMERAS + "colmap:read",
+        files=tuple(place + name for place in _MODELS for name in ("images.txt", "cameras.txt", "images.bin")),
+        content="SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV; a binary model has to be converted first",
+        folder=True,
+        pixel_centers="half",
+        per_image=True,
+    ),
+    easymocap=CameraFormat(
+        "EasyMocap",
+        _CAMERAS + "easymocap:read",
+        files=("intri.yml", "extri.yml"),
+        content="`names`, `K_NAME`, `dist_NAME`, `Rot_NAME` or `R_NAME`, `T_NAME`",
+        folder=True,
+        up="+z",
+    ),
+    transforms=CameraFormat(
+        "NeRF, instant-ngp, nerfstudio or VHAP",
+        _CAMERAS + "transforms:read",
+        files=("transforms.json",),
+        content="JSON with `frames`: `transform_matrix` is camera-to-world with OpenGL's axes",
+        up="+z",
+        pixel_centers="half",
+        per_image=True,
+    ),
+    opencv=CameraFormat(
+        "OpenCV, AvatarReX or THuman4.0",
+        _CAMERAS + "opencv:read",
+        files=("calibration_full.json", "calibration.json"),
+        content="YAML or JSON: `K`, `R`, `T` in a map of each camera, or `K_NAME`, `R_NAME`, `T_NAME`; lens as `dist...` or "
+        "`D`, size as `imgSize`, `image_size` or `width`, `height`",
+    ),
+)
+"""Calibrations."""
+KEYPOINTS = SourceFormats(
+    humangs=SourceFormat(
+        "humangs detect",
+        _KEYPOINTS + "own:read",
+        files=("keypoints.json", "keypoints.npz"),
+        content="33 points of BlazePose; `save_keypoints` (.npz): any set",
+    ),
+    openpose=SourceFormat(
+        "OpenPose",
+        _KEYPOINTS + "openpose:read",
+        files=("openpose",),
+        content="`--write_json`, a file an image: BODY_25, hands",
+    ),
+    coco=SourceFormat(
+        "COCO, COCO-WholeBody or AlphaPose",
+        _KEYPOINTS + "coco:read",
+        files=("alphapose-results.json", "alphapose.json"),
+        content="results, or images and annotations: 17 or 133 points",
+    ),
+    mmpose=SourceFormat(
+        "MMPose",
+        _KEYPOINTS + "mmpose:read",
+        files=("rtmpose", "mmpose", "predictions"),
+        content="inferencer or demo scripts, a file an image or a video: 17 or 133 points",
+    ),
+)
+"""Keypoints of detectors; files may be folders."""
+
 
 # Motions ----------------------------------------------------------------------------------------------------------------
 

@@ -18,14 +18,66 @@ from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, r
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 
 
+def numbers(
+    value: Any,
+    file: object,
+    field: str,
+    shape: tuple[int | None, ...] | None = None,
+    *,
+    some: bool = False,
+    nulls: bool = False,
+    largest: float = math.inf,
+    dtype: type[np.floating] = np.float64,
+    error: type[FileError] = FileError,
+) -> np.ndarray:
+    """Real numbers of a file that are finite in float32, as an array.
+
+    Arguments:
+        shape: None in it is any size, None for it any shape. some: there has to be one at least.
+        nulls: null is NaN, and numbers need not be finite. largest: in magnitude.
+
+    Raises: `error` with file, field and what was expected.
+    """
+    words = "numbers" if shape is None or None in shape else f"{' x '.join(map(str, shape))} numbers".lstrip()
+    try:
+        array = np.asarray(value)
+        if nulls and array.dtype.kind == "O" and all(x is None or type(x) in (int, float) for x in array.flat):
+            array = array.astype(dtype)
+        if array.dtype.kind not in "fiub":  # numpy would read numbers in words, too
+            raise TypeError
+        array = array.astype(dtype)
+    except (ValueError, TypeError, OverflowError):
+        raise error(file, field, f"expected {words}") from None
+    if some and not array.size:
+        raise error(file, field, f"expected at least one number, got shape {array.shape}")
+    if shape is not None and not _fits(array, shape):
+        raise error(file, field, f"expected shape {_in_words(shape)}, got {array.shape}")
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(array.astype(np.float32, copy=False))
+    if not nulls and not finite.all():
+        where = np.argwhere(~finite)[0].tolist()
+        raise error(file, field, f"expected finite numbers, got {array[tuple(where)]} at index {where}")
+    if largest < math.inf and array.size and np.abs(array).max() > largest:
+        where = [int(i) for i in np.unravel_index(np.abs(array).argmax(), array.shape)]
+        found = f"got {array[tuple(where)]:.4g} at index {where}: another unit?"
+        raise error(file, field, f"expected numbers of at most {largest:.4g}, {found}")
+    return array
+
+
+def _fits(array: np.ndarray, shape: tuple[int | None, ...]) -> bool:
+    return array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+
+
+def _in_words(shape: tuple[int | None, ...]) -> str:
+    return str(tuple("any" if size is None else size for size in shape)).replace("'", "")
+
+
 def check_array(
     name: str, array: np.ndarray, shape: tuple[int | None, ...], low: float = -math.inf, high: float = math.inf
 ) -> None:
     """Real numbers in [low, high] that are finite in float32, of a shape in which None is any size."""
-    fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-    if not fits:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise Refused(f"{name}: expected shape ({wanted}), got {array.shape}")
+    if not _fits(array, shape):
+        raise Refused(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
     if array.dtype.kind not in "fiu":
         raise Refused(f"{name}: expected real numbers, got {array.dtype}")
     if not array.size:
@@ -134,8 +186,8 @@ class ArrayFile:
     def numbers(
         self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
     ) -> Float[np.ndarray, "..."]:
-        """Finite float64 numbers under a key, as `checked_numbers`."""
-        return checked_numbers(self.array(key), self.path, key, shape, largest, self.error)
+        """Finite float64 numbers under a key, at least one, see `numbers`."""
+        return numbers(self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error)
 
     def number(self, key: str) -> float:
         """A single number, however nested. Raises: as `numbers`."""
@@ -147,33 +199,3 @@ class ArrayFile:
         if array.min() < 0 or array.max() >= bound:
             raise self.error(self.path, key, f"expected indices in [0, {bound})")
         return array
-
-
-def checked_numbers(
-    value: Any,
-    file: object,
-    key: str,
-    shape: tuple[int | None, ...] | None,
-    largest: float = np.inf,
-    error: type[FileError] = FileError,
-) -> Float[np.ndarray, "..."]:
-    """Finite float64 numbers, at least one. shape: None in it is any size, None for it any shape. largest: in magnitude."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise error(file, key, f"expected real numbers, got {array.dtype}")
-    shape = (None,) * array.ndim if shape is None else shape
-    fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-    if 0 in array.shape:
-        raise error(file, key, f"expected at least one number, got shape {array.shape}")
-    if not fits:
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise error(file, key, f"expected shape ({wanted}), got {array.shape}")
-    array = array.astype(np.float64)
-    if not np.isfinite(array).all():
-        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
-        raise error(file, key, f"expected finite numbers, got {array[tuple(where)]} at index {where}")
-    if largest < np.inf and np.abs(array).max() > largest:
-        where = [int(i) for i in np.unravel_index(np.abs(array).argmax(), array.shape)]
-        found = f"got {array[tuple(where)]:.4g} at index {where}: another unit?"
-        raise error(file, key, f"expected numbers of at most {largest:.4g}, {found}")
-    return array

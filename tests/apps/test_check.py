@@ -140,7 +140,7 @@ def test_without_masks_no_wrong_mistake_is_named(tmp_path, mistake):
     report = check_capture(capture(MISTAKES[mistake], masks=False), tmp_path / "check.png")
     for view in report.views:
         assert view.iou is None
-        assert all(mistake in warning for warning in view.warnings if "would fit" in warning)
+        assert all(mistake in warning for warning in view.warnings if "it would fit if" in warning)
     assert str(report).count("no mask") == 3
 
 
@@ -188,8 +188,8 @@ def test_warnings_tell_what_is_wrong(tmp_path):
     behind = np.asarray(cameras()[0].center) * 3
     assert "the body is behind the camera" in warnings(translations=behind[None])
     assert "outside the frame" in warnings(translations=np.array([[0.0, 5.0, 0.0]]))
-    assert "IoU 0." in warnings(translations=np.array([[0.0, 0.7, 0.0]]))
-    assert "in metres?" in warnings(translations=-50 * behind[None])
+    assert "body and mask do not agree" in warnings(translations=np.array([[0.0, 0.7, 0.0]]))
+    assert "the body is tiny, in metres" in warnings(translations=-50 * behind[None])
     assert "mask is empty" in warnings(empty_masks=True)
     right = capture()
     masks = np.array(right.masks)

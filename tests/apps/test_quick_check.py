@@ -11,7 +11,7 @@ from humangs_jax.apps.quick_check import likely_mistakes
 from humangs_jax.body.model import person_vertices
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.surface_points import surface_points
+from humangs_jax.data.usable_views import surface_points
 
 SECONDS = 0.5
 """Of the processor, for four photos: 0.07 measured. Less than the import of a library or a compilation would take."""
@@ -83,7 +83,7 @@ def test_right_captures_have_no_warnings(right):
 def test_without_masks_only_what_is_out_of_the_frame_is_seen(right):
     inverse = replace(right.cameras, cam_from_world=jnp.linalg.inv(right.cameras.cam_from_world))
     (found,) = likely_mistakes(dataclasses.replace(right, masks=None, cameras=inverse))
-    assert "most of the body is outside the frame; they would if cam_from_world is the inverse" in found
+    assert "most of the body is outside the frame; it would fit if cam_from_world is the inverse" in found
 
 
 def test_the_points_lie_on_the_body(right):

@@ -19,7 +19,7 @@ from humangs_jax.avatar.video import write_video
 from humangs_jax.cli.start import Start
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.people_file import SeenPerson
+from humangs_jax.data.keypoints.own import SeenPerson
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import blazepose

@@ -64,7 +64,7 @@ def test_photos_and_masks_are_copied_as_they_are(rig, tmp_path):
     assert report.warnings == ()
     assert str(report).splitlines() == [
         f"{rig[2]}: 4 photos of 64 x 48 pixels: 4 cameras, 1 frame",
-        f"read as: calibration of K, R, T ({rig[0]}): cam_from_world, OpenCV axes; +y up; 1 m per unit; "
+        f"read as: OpenCV, AvatarReX or THuman4.0 ({rig[0]}): cam_from_world, OpenCV axes; +y up; 1 m per unit; "
         "pixel centres at whole numbers (0.5 added to cx and cy)",
         "the cameras stand 2.3 m from where they look",
     ]
@@ -293,7 +293,7 @@ def test_cameras_that_look_at_head_and_feet_are_fine(rig):
 
 def test_wrong_scale_and_wrong_image_size_are_warned_of(rig):
     K, poses = written.scene()
-    assert "--scale" in import_rig(rig, scale=0.001).warnings[0]
+    assert "is scale, the metres" in import_rig(rig, scale=0.001).warnings[0]
     written.write_calibration_full(rig[0], K * [[2], [2], [1]], poses, NAMES)
     warning = import_rig(rig, overwrite=True).warnings[0]
     assert warning.startswith("a: the principal point") and "another size" in warning
@@ -373,7 +373,7 @@ def test_photos_that_do_not_fit_are_named(rig, tmp_path):
         ({"scale": 0.0}, "scale 0"),
         ({"scale": float("nan")}, "scale nan"),
         ({"up": "z"}, r"^up z: expected one of \+x, -x"),
-        ({"pixel_centers": "corner"}, "^pixel_centers corner: expected integer or half"),
+        ({"pixel_centers": "corner"}, "^pixel_centers corner: expected one of integer, half"),
     ],
 )
 def test_wrong_options_are_named(rig, options, problem):
@@ -464,7 +464,7 @@ def test_sources_that_are_none_are_named(rig, tmp_path):
         (empty.parent / file).write_text(text)
     for source, problem in (
         (tmp_path / "no", "no: no such file or folder"),
-        (empty, "empty: no cameras found: expected a COLMAP text model"),
+        (empty, "empty: no cameras found: expected COLMAP text model"),
         (binary, "binary COLMAP model: .*model_converter"),
         (half, r"extri\.yml: no such file"),
         (tmp_path / "nothing.json", r"nothing\.json: empty"),

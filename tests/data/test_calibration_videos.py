@@ -70,7 +70,7 @@ def test_what_is_wrong_with_a_video_is_one_line(tmp_path):
     (tmp_path / "masks").mkdir()
     with pytest.raises(CaptureError, match=r"a: expected a video of photos and one of masks"):
         import_cameras(*rig, up="+y", masks=tmp_path / "masks")
-    with pytest.raises(ValueError, match="--every 0"):
+    with pytest.raises(ValueError, match="every 0"):
         import_cameras(*rig, up="+y", every=0)
     written.write_photos(tmp_path / "photos", [f"{name}.png" for name in NAMES])
     with pytest.raises(CaptureError, match="frames can be chosen of videos only"):

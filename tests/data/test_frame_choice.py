@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.avatar.video import write_video
-from humangs_jax.data.calibration.frame_choice import NOTHING_NEW, PHOTOS, choose_frames, looked_at
-from humangs_jax.data.calibration.videos import grey_frames, write_frames
+from humangs_jax.data.calibration.videos import NOTHING_NEW, PHOTOS, choose_frames, grey_frames, looked_at, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.images import read_image
 from humangs_jax.io.reading import Limits, Refused, set_limits

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from seen_people import person
 
-from humangs_jax.apps import fit_sheet as module
-from humangs_jax.apps.check import LEFT, RIGHT
-from humangs_jax.apps.fit_sheet import fit_sheet, plot_over_time
+from humangs_jax.apps import check as module
+from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet, plot_over_time
 from humangs_jax.avatar.sheets import GAP
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting.examination import examine
@@ -90,7 +89,7 @@ def test_many_views_and_frames(tmp_path, monkeypatch):
 def test_labels(sheet):
     views = (ViewReport("a", 0, 17, 2.06, 4.0, 0.0), ViewReport("b", 0, 0, np.nan, np.nan, 0.0))
     examination = dataclasses.replace(sheet[1], report=FitReport("keypoints", views=views))
-    assert [module._label(examination, i) for i in (0, 1)] == ["a  2.1 px", "b  no keypoints"]
+    assert [module._fit_label(examination, i) for i in (0, 1)] == ["a  2.1 px", "b  no keypoints"]
 
 
 def test_the_plot_rises_and_has_gaps():

@@ -30,7 +30,7 @@ from humangs_jax.body.library import load_body, save_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.smplx import load_hands, load_smplx
 from humangs_jax.core.configuration import config_to_json
-from humangs_jax.data.calibration.formats import read_calibration
+from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation

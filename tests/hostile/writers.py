@@ -330,9 +330,6 @@ def stand_ins(variant):
         return SimpleNamespace(
             shaded=np.repeat(image[..., None], 3, -1),
             covered=image > 0.5,
-            inside=np.float32(1),
-            before=np.float32(1),
-            height=np.float32(0.8),
         )
 
     def in_scan(*_, **__):
@@ -381,6 +378,11 @@ def stand_ins(variant):
         ),
         ("avatar.layers", "draw", lambda _, poses, *__: iter(some_renderings(variant, len(poses)))),
         ("apps.check", "_body_image", shown),
+        (
+            "apps.check",
+            "faults",
+            lambda capture: ((), (SimpleNamespace(problem=None, inside=1.0),) * capture.view_count),
+        ),
         ("apps.check", "_posed_frames", lambda capture: {0: np.zeros((4, 3))}),
         ("apps.demo", "load_weights", lambda *_: (None, tiny())),
         ("apps.demo", "reconstruct", avatar),

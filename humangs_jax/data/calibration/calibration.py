@@ -5,14 +5,17 @@ pixel centres still those of the source. `in_capture_convention` makes metres, y
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.data.capture_checks import CaptureError, floats, numbers
-from humangs_jax.io.reading import limits
+from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, floats, numbers
+from humangs_jax.data.formats import CAMERAS, CameraFormat
+from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
 """R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced by the nearest rotation."""
@@ -96,6 +99,59 @@ class Calibration:
     stations: int | None = None
     mask_key: str | None = None
     upright: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Source:
+    """What a reader of a format gets."""
+
+    path: Path
+    """A file, or the folder of a format of several files."""
+    photo_size: Callable[[str], tuple[int, int]]
+    """Width and height of the photo of a name, for formats that do not say them."""
+
+    @functools.cached_property
+    def text(self) -> str:
+        """Of the file. Raises: CaptureError."""
+        return checked_text(self.path)
+
+    @functools.cached_property
+    def json(self) -> Any:
+        """The value of a file that begins like a JSON object, else None. Raises: CaptureError."""
+        return checked_json(self.path, self.text) if self.text.lstrip().startswith("{") else None
+
+    def calibration(
+        self, format: CameraFormat, cameras: Sequence[CalibratedCamera], file: Path | None = None, **more: Any
+    ) -> Calibration:
+        """These cameras, with what the format means. file: that errors name, `path` if None."""
+        what = format.about, file or self.path, tuple(cameras), format.per_image, format.pixel_centers, format.up
+        return Calibration(*what, **more)
+
+
+def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibration:
+    """The calibration in a file or folder of one of the `CAMERAS`; its content decides which one.
+
+    photo_size: as in `Source`.
+
+    Raises: CaptureError, one line that names the file and what was expected.
+    """
+    if not path.exists():
+        raise CaptureError(path, "", "no such file or folder")
+    with reading(path, "calibration", CaptureError):
+        format = None if path.is_dir() else CAMERAS.of_name(path)
+        if path.is_dir():
+            if (found := CAMERAS.found(path)) is None:
+                raise CaptureError(path, "", f"no cameras found: expected {CAMERAS.listed()}")
+            format, path = found
+        if format is not None and format.folder:
+            source = Source(path.parent, photo_size)
+        else:
+            source = Source(path, photo_size)
+            format = CAMERAS.of_content(source)
+        if format is None:
+            problem = "not a known format" if source.text.strip() else "empty"
+            raise CaptureError(path, "", f"{problem}: expected {CAMERAS.listed()}")
+        return format(source, format)
 
 
 def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel_centers: str) -> Calibration:

@@ -6,21 +6,25 @@ length unit and the axes of the world are arbitrary.
 """
 
 import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.calibration.calibration import (
     UNDISTORT_BEFORE,
     CalibratedCamera,
     Calibration,
     Observations,
+    Source,
     brown_conrady,
     image_size,
     intrinsics,
     pose_matrix,
 )
 from humangs_jax.data.capture_checks import CaptureError, checked_text, floats
+from humangs_jax.data.formats import CameraFormat
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -32,11 +36,12 @@ PARAMETERS = {
 """Camera models and their parameters in cameras.txt."""
 
 
-def read_colmap(folder: Path) -> Calibration:
-    """The registered images of a text model, in the order of images.txt.
-
-    Raises: CaptureError naming file and line.
-    """
+def read(source: Source, format: CameraFormat) -> Calibration:
+    """The registered images of a text model, in the order of images.txt. Raises: CaptureError naming file and line."""
+    folder = source.path
+    if not any((folder / name).is_file() for name in ("images.txt", "cameras.txt")):
+        remedy = f"colmap model_converter --input_path {folder} --output_path DIR --output_type TXT"
+        raise CaptureError(folder, "", f"a binary COLMAP model: expected a text model; {remedy}")
     lenses = _read_cameras(folder / "cameras.txt")
     file = folder / "images.txt"
     cameras, seen = [], []
@@ -48,10 +53,10 @@ def read_colmap(folder: Path) -> Calibration:
     if not cameras:
         raise CaptureError(file, "", "no image is registered in this model")
     observations = _observations(seen, folder / "points3D.txt")
-    return Calibration("COLMAP text model", file, tuple(cameras), True, "half", "-y", observations)
+    return source.calibration(format, cameras, file=file, observations=observations)
 
 
-def _read_cameras(file):
+def _read_cameras(file: Path) -> dict[str, CalibratedCamera]:
     """Camera id -> camera without name and pose."""
     lenses = {}
     for number, line in _data_lines(file):
@@ -74,7 +79,7 @@ def _read_cameras(file):
     return lenses
 
 
-def _read_images(file):
+def _read_images(file: Path) -> Iterator[tuple[int, np.ndarray, str, str, np.ndarray]]:
     """(line number, cam_from_world, name, camera id, (n, 3) points as x y id) of each image."""
     lines = [(i, line) for i, line in enumerate(checked_text(file).splitlines(), 1) if not line.startswith("#")]
     at = 0
@@ -97,7 +102,7 @@ def _read_images(file):
         yield number, pose, parts[9].strip(), parts[8], points
 
 
-def _observations(seen, file):
+def _observations(seen: Sequence[np.ndarray], file: Path) -> Observations | None:
     """Points with their pixels, or None where the model has no points."""
     if not file.is_file():
         return None
@@ -114,19 +119,19 @@ def _observations(seen, file):
     return Observations(points, np.asarray([row[0] for row in rows]), np.asarray([row[1:3] for row in rows], float))
 
 
-def _data_lines(file):
+def _data_lines(file: Path) -> list[tuple[int, str]]:
     lines = enumerate(checked_text(file).splitlines(), 1)
     return [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
 
 
-def _numbers(words, file, where):
+def _numbers(words: Iterable[str], file: Path, where: str) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
         raise CaptureError(file, where, error) from None
 
 
-def _rotation(quaternion, file, where):
+def _rotation(quaternion: Float[np.ndarray, "4"], file: Path, where: str) -> Float[np.ndarray, "3 3"]:
     from scipy.spatial.transform import Rotation
 
     if not np.any(quaternion):

@@ -14,21 +14,30 @@ from typing import get_args
 
 import numpy as np
 
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
+    CalibratedCamera,
     Calibration,
     PixelCenters,
     in_capture_convention,
+    read_calibration,
     undistort,
 )
-from humangs_jax.data.calibration.checks import Checks, check_calibration
-from humangs_jax.data.calibration.formats import read_calibration
-from humangs_jax.data.calibration.mask_checks import check_masks, has_alpha
-from humangs_jax.data.calibration.orientation import Turn, find_turns, turn_notes, turned_cameras
-from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
+from humangs_jax.data.calibration.checks import Checks, check_calibration, check_masks, has_alpha
+from humangs_jax.data.calibration.photos import (
+    Photo,
+    Turn,
+    find_photo,
+    find_photos,
+    find_turns,
+    photo_size,
+    turn_notes,
+    turned_cameras,
+)
 from humangs_jax.data.calibration.videos import photos_of_videos
-from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
+from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, few
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.atomic import replace_folder
@@ -43,11 +52,7 @@ NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What was imported and how it was read; `str(report)` is what the command line prints.
-
-    notes: further lines about it. masks: whether it has mask files. turned: photos that were turned upright, see `orientation`.
-    heic: photos that were HEIC, or their masks.
-    """
+    """What was imported and how it was read; `str(report)` is what the command line prints."""
 
     out: Path
     format: str
@@ -64,9 +69,13 @@ class ImportReport:
     undistorted: int
     checks: Checks
     notes: tuple[str, ...] = ()
+    """Further lines."""
     masks: bool = False
+    """Whether it has mask files."""
     turned: int = 0
+    """Photos that were turned upright by their EXIF orientation."""
     heic: int = 0
+    """Photos that were HEIC, or their masks."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -122,10 +131,7 @@ def import_cameras(
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
     scale = 1.0 if scale is None else scale
-    _check_options(scale, up, pixel_centers)
-    for name, value in (("every", every), ("frames", frames)):
-        if value is not None and value < 1:
-            raise ValueError(f"--{name} {value}: expected at least 1")
+    _check_options(scale, up, pixel_centers, every, frames)
     _check_folders(source, images, masks, out, overwrite)
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
         calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
@@ -153,14 +159,16 @@ def import_calibration(
     about_masks = check_masks(photos)
     converted = turned_cameras(in_capture_convention(calibration, scale, up, pixel_centers), photos, turns)
     for camera in converted.cameras:
-        checked_camera(camera.K, camera.cam_from_world, *_size(camera), calibration.file, camera.name)
+        assert camera.width is not None and camera.height is not None  # those of its photos
+        checked_camera(camera.K, camera.cam_from_world, camera.width, camera.height, calibration.file, camera.name)
     checks = check_calibration(calibration, converted, up)
     frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
     notes, about_turns = turn_notes(photos, turns)
     if heic := sum(map(_of_phones, photos)):
         notes = (*notes, f"written as PNG: {heic} HEIC photo{'' if heic == 1 else 's'}")
     notes = (*notes, *_padding_notes(turns, canvas))
-    more = [*about_turns, *about_masks, *_unused_masks(calibration, photos, masks)]
+    named, unused = _named_masks(calibration, photos, masks)
+    more = [*about_turns, *about_masks, *([unused] if unused else ())]
     if cameras > 1 and frames == len(photos) > 1:
         more.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
     checks = dataclasses.replace(checks, warnings=(*checks.warnings, *more))
@@ -170,8 +178,7 @@ def import_calibration(
     write = lambda folder: cut.extend(_write(folder, converted, photos, turns, names, canvas))
     replace_folder(out, write, mark="capture.json")
     if cut:
-        which = f"{cut[0]} and {len(cut) - 1} more" if len(cut) > 1 else cut[0]
-        padded = f"the person is cut off where white was added to {which}: it is taken for background"
+        padded = f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background"
         checks = dataclasses.replace(checks, warnings=(*checks.warnings, padded))
     return ImportReport(
         out=out,
@@ -188,40 +195,43 @@ def import_calibration(
         convention=calibration.convention,
         undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
         checks=checks,
-        notes=(*notes, *_named_masks(calibration, photos, masks)),
+        notes=(*notes, named) if named else notes,
         masks=photos[0].mask is not None,
         turned=sum(turn.rewrites for turn in turns),
         heic=heic,
     )
 
 
-def _named_masks(calibration, photos, masks):
-    if masks is not None or photos[0].mask is None:
-        return ()
-    return (f"masks: those that {calibration.file.name} names ({calibration.mask_key})",)
-
-
-def _unused_masks(calibration, photos, masks):
-    """A warning about masks that the calibration names and the capture does not get."""
-    if calibration.mask_key is None or (masks is None and photos[0].mask is not None):
-        return ()
+def _named_masks(
+    calibration: Calibration, photos: Sequence[Photo], masks: Path | None
+) -> tuple[str | None, str | None]:
+    """A note about masks that the calibration names, and a warning about those that the capture does not get."""
+    if calibration.mask_key is None:
+        return None, None
     named = f"{calibration.mask_key} of {calibration.file.name}"
     if masks is not None:
-        return (f"{named}: not used, the masks are those in {masks}",)
+        return None, f"{named}: not used, the masks are those in {masks}"
+    if photos[0].mask is not None:
+        return f"masks: those that {calibration.file.name} names ({calibration.mask_key})", None
     first = next(camera.mask for camera in calibration.cameras if camera.mask)
-    return (f"{named}: no such mask, {first}: imported without masks",)
+    return None, f"{named}: no such mask, {first}: imported without masks"
 
 
-def _check_options(scale, up, pixel_centers):
+def _check_options(scale: float, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
     if not 0 < scale < float("inf"):
         raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
-    if up is not None and up not in ROTATION_TO_Y_UP:
-        raise ArgumentError("up", f"{up}: expected one of {', '.join(ROTATION_TO_Y_UP)}")
-    if pixel_centers is not None and pixel_centers not in get_args(PixelCenters):
-        raise ArgumentError("pixel_centers", f"{pixel_centers}: expected {' or '.join(get_args(PixelCenters))}")
+    for name, word, known in (
+        ("up", up, tuple(ROTATION_TO_Y_UP)),
+        ("pixel_centers", pixel_centers, get_args(PixelCenters)),
+    ):
+        if word is not None and word not in known:
+            raise ArgumentError(name, f"{word}: expected one of {', '.join(known)}")
+    for name, value in (("every", every), ("frames", frames)):
+        if value is not None and value < 1:
+            raise ArgumentError(name, f"{value}: expected at least 1")
 
 
-def _check_folders(source, images, masks, out, overwrite):
+def _check_folders(source: Path, images: Path, masks: Path | None, out: Path, overwrite: bool) -> None:
     for folder in (images, masks):
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
@@ -234,19 +244,14 @@ def _check_folders(source, images, masks, out, overwrite):
             raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
 
 
-def _size_by_name(images, name, source):
+def _size_by_name(images: Path, name: str, source: Path) -> tuple[int, int]:
     photo = find_photo(images, name)
     if photo is None:
         raise CaptureError(source, name, f"no such photo (PNG or JPEG) in {images}")
     return photo_size(photo)
 
 
-def _size(camera):
-    assert camera.width is not None and camera.height is not None  # _with_photo_sizes has been here
-    return camera.width, camera.height
-
-
-def _canvas(images, photos, turns):
+def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
     """Width and height of what is written: the largest of all photos, upright.
 
     Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be read together.
@@ -267,11 +272,11 @@ def _canvas(images, photos, turns):
     return width, height
 
 
-def _by(width, height):
+def _by(width: int, height: int) -> str:
     return f"{width} x {height}"
 
 
-def _padding_notes(turns, canvas):
+def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> tuple[str, ...]:
     """What was done to photos of several sizes, a line."""
     counts = Counter(turn.size for turn in turns)
     if set(counts) == {canvas}:
@@ -320,12 +325,12 @@ def _write(
     return cut
 
 
-def _of_phones(photo):
+def _of_phones(photo: Photo) -> bool:
     """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot read it."""
     return any(file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask))
 
 
-def _copy(folder, photo, name):
+def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
     """The files as they are; their paths for capture.json."""
     files = {"image": f"images/{name}{photo.image.suffix}"}
     shutil.copyfile(photo.image, folder / files["image"])
@@ -335,7 +340,7 @@ def _copy(folder, photo, name):
     return files
 
 
-def _is_transparent(photo):
+def _is_transparent(photo: Path) -> bool:
     """Whether any pixel is."""
     if not read_checked(has_alpha, photo):
         return False
@@ -343,7 +348,15 @@ def _is_transparent(photo):
     return alpha is not None and alpha.min() < 1
 
 
-def _rewrite(folder, photo, turn, name, camera, transparent, canvas):
+def _rewrite(
+    folder: Path,
+    photo: Photo,
+    turn: Turn,
+    name: str,
+    camera: CalibratedCamera,
+    transparent: bool,
+    canvas: tuple[int, int],
+) -> tuple[dict[str, str], bool]:
     """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it does not see are white and
     background.
 
@@ -369,13 +382,15 @@ def _rewrite(folder, photo, turn, name, camera, transparent, canvas):
     return files, at_rim
 
 
-def _reaches(person, canvas):
+def _reaches(person: Bool[np.ndarray, "h w"], canvas: tuple[int, int]) -> bool:
     """Whether there is anybody at the right or lower rim of (h, w), on the side where it is smaller than the canvas."""
     height, width = person.shape
     return bool((width < canvas[0] and person[:, -1].any()) or (height < canvas[1] and person[-1].any()))
 
 
-def _padded(pixels, canvas, fill):
+def _padded(
+    pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
+) -> Float[np.ndarray, "height width *c"]:
     """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added are opaque white."""
     (height, width), (right, below) = pixels.shape[:2], canvas
     margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))

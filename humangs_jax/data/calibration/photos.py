@@ -1,14 +1,22 @@
-"""Which photo belongs to which camera and to which frame, by file names."""
+"""Which photo belongs to which camera and to which frame, by file names; and which way up it is, by its EXIF orientation.
+
+Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it. What an import writes has none:
+pixels are turned upright, and with them the camera, if it was calibrated for the pixels as stored (COLMAP). A calibration of the
+turned photo (OpenCV) is told by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
+"""
 
 import dataclasses
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from humangs_jax.data.calibration.calibration import Calibration
-from humangs_jax.data.capture_checks import CaptureError
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
+from humangs_jax.data.capture_checks import CaptureError, few
 from humangs_jax.data.photos import read_checked
-from humangs_jax.io.images import image_size
+from humangs_jax.io.images import image_size, orientation, oriented
 from humangs_jax.io.reading import inside, reading
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
@@ -18,16 +26,14 @@ LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
 @dataclasses.dataclass(frozen=True)
 class Photo:
-    """A photo on disk: its camera and its frame (both counted from 0), and its mask or None.
-
-    key: path relative to the folder of photos with slashes and without suffix.
-    """
+    """A photo on disk: its camera and its frame (both counted from 0), and its mask or None."""
 
     image: Path
     mask: Path | None
     camera: int
     frame: int
     key: str
+    """Path relative to the folder of photos with slashes and without suffix."""
 
 
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
@@ -51,19 +57,16 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
     return tuple(photos)
 
 
-def _named_masks(calibration, images):
+def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     """The masks that a calibration names, by camera: in its folder, in that of the photos or in the one around. All or none."""
-    found, missing = {}, None
-    for i, camera in enumerate(calibration.cameras):
-        path = None
-        for folder in (calibration.file.parent, images, images.parent) if camera.mask else ():
-            path = _any_suffix(folder / camera.mask.replace("\\", "/"))
-            if path is not None:
+    found: dict[int, Path] = {}
+    for i, name in ((i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask):
+        for folder in (calibration.file.parent, images, images.parent):
+            if (path := _any_suffix(folder / name.replace("\\", "/"))) is not None:
                 _check_inside(folder, path.absolute())
                 found[i] = path
                 break
-        if path is None and missing is None:
-            missing = camera
+    missing = next((camera for i, camera in enumerate(calibration.cameras) if i not in found), None)
     if found and missing is not None:
         what = f"{missing.mask}: no such mask" if missing.mask else "missing"
         problem = f"{what}, but other images have one: expected all or none, or a folder of masks"
@@ -85,12 +88,12 @@ def find_photo(folder: Path, name: str) -> Path | None:
     return photo
 
 
-def _check_inside(folder, name):
+def _check_inside(folder: Path, name: str | Path) -> None:
     with reading(folder, "path", CaptureError):
         inside(folder, str(name), photo=True)
 
 
-def _any_suffix(path):
+def _any_suffix(path: Path) -> Path | None:
     """The file, or the one of that name with another suffix of photos, or with one more."""
     stems = [path.name, path.stem] if is_photo(path) else [path.name]
     candidates = [path] if is_photo(path) else []
@@ -108,7 +111,7 @@ def photo_size(path: Path) -> tuple[int, int]:
     return read_checked(image_size, path)
 
 
-def _of_images(images, names, file):
+def _of_images(images: Path, names: Sequence[str], file: Path) -> list[tuple[int, Path]]:
     """(camera, photo) where each image has a camera of its own."""
     photos: dict[Path, str] = {}
     for name in names:
@@ -121,7 +124,7 @@ def _of_images(images, names, file):
     return list(enumerate(photos))
 
 
-def _mask(masks, images, image):
+def _mask(masks: Path, images: Path, image: Path) -> Path:
     """The mask at the same path in the folder of masks (COLMAP: with one more suffix); AvatarReX: in mask/pha beside the photo.
 
     AvatarReX has photos and masks in one folder, so that the photo itself can be what is found first.
@@ -133,7 +136,7 @@ def _mask(masks, images, image):
     raise CaptureError(masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it")
 
 
-def _of_cameras(calibration, images):
+def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
     """(camera, frame, photo) where each camera took one photo or several."""
     names = [camera.name for camera in calibration.cameras]
     layouts = (_folders_of_cameras(images, names), _folders_of_frames(images, names), _single_photos(images, names))
@@ -149,25 +152,25 @@ def _of_cameras(calibration, images):
     return sorted(found, key=lambda entry: (entry[1], entry[0]))
 
 
-def _folders_of_cameras(images, names):
+def _folders_of_cameras(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
     """For each camera, frame name -> photo."""
     for name in names:  # of a file: "../.." would be any folder
         _check_inside(images, name)
     return [{p.stem: p for p in _photos_in(images / name)} for name in names]
 
 
-def _folders_of_frames(images, names):
+def _folders_of_frames(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
     folders = [entry for entry in images.iterdir() if entry.is_dir()]
     of_frame = {folder.name: {p.stem: p for p in _photos_in(folder)} for folder in folders}
     return [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names]
 
 
-def _single_photos(images, names):
+def _single_photos(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
     photos = {p.stem: p for p in _photos_in(images)}
     return [{"": photos[name]} if name in photos else {} for name in names]
 
 
-def _photos_in(folder):
+def _photos_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return [Path(entry.path) for entry in os.scandir(folder) if is_photo(Path(entry.name)) and entry.is_file()]
@@ -177,3 +180,161 @@ def _in_order(names: Iterable[str]) -> list[str]:
     """Names sorted by number where all are numbers (10 after 9), else by letter."""
     names = list(names)
     return sorted(names, key=lambda name: (int(name), name)) if all(n.isdecimal() for n in names) else sorted(names)
+
+
+# Orientation ----------------------------------------------------------------------------------------------------------
+
+UNMIRRORED = {1: 1, 2: 1, 3: 3, 4: 3, 5: 6, 6: 6, 7: 8, 8: 8}
+"""Flags, and those that turn alike without mirroring."""
+QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Clockwise quarter turns that a flag asks for."""
+MIRROR = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Turn:
+    """How the pixels of a photo and of its mask become what is imported."""
+
+    flag: int
+    """Of the photo."""
+    photo: int
+    """The flag to obey."""
+    mask: tuple[int, ...]
+    """Flags to obey, one after the other."""
+    camera: int
+    """The flag by which the camera is turned, 1 for a calibration of the turned photo."""
+    size: tuple[int, int]
+    """Width and height after it."""
+    certain: bool = True
+    """Whether sizes tell what was calibrated."""
+
+    @property
+    def rewrites(self) -> bool:
+        """Whether the files cannot be copied as they are."""
+        return self.flag != 1 or any(flag != 1 for flag in self.mask)
+
+    def image(self, pixels: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "height width *c"]:
+        """The photo, or its alpha channel, upright."""
+        return oriented(pixels, self.photo)
+
+    def of_mask(self, pixels: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "height width"]:
+        """The mask, upright."""
+        for flag in self.mask:
+            pixels = oriented(pixels, flag)
+        return pixels
+
+
+def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
+    """One for each photo.
+
+    Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
+    calibrated for pixels as stored, but whose photos have different flags.
+    """
+    turns = tuple(_find_turn(calibration.cameras[photo.camera], photo, calibration.upright) for photo in photos)
+    first: dict[int, tuple[Photo, Turn]] = {}
+    for photo, turn in zip(photos, turns, strict=True):
+        other, known = first.setdefault(photo.camera, (photo, turn))
+        if known.camera != turn.camera:
+            problem = f"EXIF orientation {turn.flag}, but {other.image.name} of the same camera has {known.flag}"
+            raise CaptureError(photo.image, "", f"{problem}: expected one; turn the photos before calibrating")
+    return turns
+
+
+def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
+    flag, stored = read_checked(orientation, photo.image), photo_size(photo.image)
+    shown = stored if flag < 5 else stored[::-1]
+    calibrated = stored if camera.width is None else (camera.width, camera.height)
+    if camera.width is None and flag >= 5:  # the principal point is near the middle
+        calibrated = min(stored, shown, key=lambda size: np.abs(camera.K[:2, 2] / size - 0.5).max())
+    if calibrated not in (stored, shown):
+        told = "" if flag == 1 else f" (EXIF orientation {flag})"
+        problem = f"was calibrated with {calibrated[0]} x {calibrated[1]}: expected the same"
+        if calibrated == stored[::-1]:
+            problem += "; was it turned (an EXIF orientation that got lost)?"
+        raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
+    as_stored = calibrated == stored and not upright
+    own = UNMIRRORED[flag] if as_stored else flag
+    size = stored if own < 5 else stored[::-1]
+    mask = () if photo.mask is None else _mask_flags(photo.mask, flag, own, stored, shown)
+    return Turn(flag, own, mask, own if as_stored else 1, size, certain=flag == 1 or stored != shown or upright)
+
+
+def _mask_flags(mask: Path, flag: int, own: int, stored: tuple[int, int], shown: tuple[int, int]) -> tuple[int, ...]:
+    """A mask with a flag, or of the size of the turned photo, shows it as turned; else as stored."""
+    back = (MIRROR,) if own != flag else ()
+    mask_flag, size = read_checked(orientation, mask), photo_size(mask)
+    if mask_flag != 1:
+        size = size if mask_flag < 5 else size[::-1]
+        if size == shown:
+            return mask_flag, *back
+    elif flag == 1 and size == stored:
+        return ()
+    elif size == shown:  # where both sizes are the same: most tools that make masks obey the flag
+        return back
+    elif size == stored:
+        return (own,)
+    wanted = " or ".join(f"{width} x {height}" for width, height in dict.fromkeys((shown, stored)))
+    raise CaptureError(mask, "size", f"{size[0]} x {size[1]}, but its photo has {wanted}: expected the same")
+
+
+def turned_cameras(calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]) -> Calibration:
+    """The calibration, in the convention of captures, of the photos as they are imported, sizes included."""
+    cameras, seen = list(calibration.cameras), calibration.observations
+    pixels = None if seen is None else seen.pixels.copy()
+    for i, turn in {photo.camera: turn for photo, turn in zip(photos, turns, strict=True)}.items():
+        width, height = turn.size if QUARTERS[turn.camera] % 2 == 0 else turn.size[::-1]
+        camera = dataclasses.replace(cameras[i], width=width, height=height)
+        for _ in range(QUARTERS[turn.camera]):
+            if seen is not None and pixels is not None:
+                own = seen.cameras == i
+                pixels[own] = np.stack([camera.height - pixels[own, 1], pixels[own, 0]], axis=-1)
+            camera = _quarter_turned(camera)
+        cameras[i] = camera
+    if seen is not None and pixels is not None:
+        seen = dataclasses.replace(seen, pixels=pixels)
+    return dataclasses.replace(calibration, cameras=tuple(cameras), observations=seen)
+
+
+def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
+    """The camera of the photo turned clockwise: pixel (x, y) moves to (height - y, x), and so do the camera's axes."""
+    assert camera.width is not None and camera.height is not None
+    turn = np.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    move = turn.copy()
+    move[0, 2] = camera.height
+    pose, distortion = camera.cam_from_world.copy(), camera.distortion
+    pose[:3] = turn @ pose[:3]
+    if distortion is not None:  # (p2, p1) is a vector of the image plane
+        k1, k2, p1, p2, k3 = distortion
+        distortion = np.asarray([k1, k2, p2, -p1, k3])
+    return dataclasses.replace(
+        camera,
+        K=move @ camera.K @ turn.T + 0.0,
+        cam_from_world=pose + 0.0,
+        width=camera.height,
+        height=camera.width,
+        distortion=distortion,
+    )
+
+
+def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What was done, and warnings about what sizes cannot tell; a line each."""
+    flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.flag != 1]
+    if not flagged:
+        return (), ()
+    count = f"{len(flagged)} photo{'' if len(flagged) == 1 else 's'}"
+    whole = "the calibration is of the turned photos"
+    stored = [turn for _, turn in flagged if turn.camera != 1 or turn.photo != turn.flag]
+    if stored:
+        whole = "their cameras, too: the calibration is of the pixels as stored"
+    notes, warnings = [f"turned upright by the EXIF orientation: {count} ({whole})"], []
+    if unsure := [(photo, turn) for photo, turn in flagged if not turn.certain]:
+        which = few([photo.image.name for photo, _ in unsure], 1)
+        of_masks = ", the mask to be of the turned photo" if unsure[0][0].mask is not None else ""
+        warnings.append(
+            f"EXIF orientation {unsure[0][1].flag} of {which}: the calibration is taken to be of the pixels as stored{of_masks}; "
+            "their sizes do not tell. If that is wrong, save the photos turned"
+        )
+    mirrored = [photo.image.name for photo, turn in flagged if turn.photo != turn.flag]
+    if mirrored:
+        warnings.append(f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so")
+    return tuple(notes), tuple(warnings)

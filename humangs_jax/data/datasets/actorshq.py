@@ -63,7 +63,7 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
                 values[key] = float(row[key])
             except (KeyError, TypeError, ValueError):
                 raise CaptureError(file, f"{name}.{key}", f"expected a number, got {row.get(key)!r}") from None
-        checked_numbers(list(values.values()), file, name, (len(COLUMNS),), float(limits().side))
+        checked_numbers(list(values.values()), file, name, (len(COLUMNS),), largest=float(limits().side))
         width, height = values["w"], values["h"]
         if width % 1 or height % 1 or min(width, height) <= 0:
             raise CaptureError(file, f"{name}.w", f"expected whole pixels, got {width:g} x {height:g}")

@@ -18,7 +18,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, PosedBody, RestBody, pos
 from humangs_jax.body.smplx import HandBasis, load_hands
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import DEFAULT_BODY
-from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.capture_checks import CaptureError, file_numbers
 from humangs_jax.io import arrays as array_files
 
 LARGEST_ANGLE = 4 * np.pi
@@ -29,7 +29,7 @@ LARGEST_COEFFICIENT = 30.0
 """Of shape and expression: standard deviations, usually below 5."""
 
 open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
-checked_numbers = functools.partial(array_files.checked_numbers, error=CaptureError)
+checked_numbers = functools.partial(file_numbers, some=True)
 
 FIRST_HAND_JOINT = 25
 """In the order of SMPL-X: 30 finger joints follow."""

@@ -89,7 +89,7 @@ class Smc:
 
     def numbers(self, key: str, shape: tuple[int | None, ...], largest: float = np.inf) -> Float[np.ndarray, "..."]:
         """Finite float64 numbers of a shape."""
-        return checked_numbers(self.array(key), self.path, key, shape, largest)
+        return checked_numbers(self.array(key), self.path, key, shape, largest=largest)
 
     def image(self, key: str) -> Float[np.ndarray, "h w c"]:
         """An encoded photo in [0, 1]."""

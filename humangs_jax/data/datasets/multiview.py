@@ -25,9 +25,9 @@ from humangs_jax.data.calibration.calibration import (
     CalibratedCamera,
     Calibration,
     in_capture_convention,
+    read_calibration,
     undistort_person,
 )
-from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_camera
 from humangs_jax.data.datasets.bodies import (
     FARTHEST,

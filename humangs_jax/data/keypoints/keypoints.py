@@ -1,21 +1,21 @@
-"""Keypoints of the views of a capture in memory, and our own file of them.
-
-The file is an npz of points (v, k, 2), confidences (v, k), the set's name, and the names of the v views. Unlike in all
-other formats the centre of the first pixel is at (0.5, 0.5).
-"""
+"""Keypoints in memory: of the views of a capture, and as files have them, not yet matched to views and persons."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.keypoints.sets import KeypointSet
-from humangs_jax.io.npz import write_npz
+from humangs_jax.data.capture_checks import CaptureError, checked_json, file_numbers
+from humangs_jax.data.keypoints.sets import SETS_BY_COUNT, KeypointSet
 
 LISTED = 5
 """Names of views in a warning, at most."""
+HALF_PIXEL = 0.5
+"""Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,19 +59,70 @@ class Keypoints:
         return tuple(found)
 
 
-def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
-    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads exactly these back.
+@dataclasses.dataclass(frozen=True, eq=False)
+class DetectedImage:
+    """The people in one image.
 
-    Raises: ValueError if the path does not end in .npz, or there is not one name per view.
+    image: its name or path as the file has it, or a number where the file has no more.
+    file: that the people are from. size: (width, height) in pixels where the file states it.
+    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and null are NaN.
     """
-    if len(names) != len(keypoints.points):
-        raise ValueError(f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}")
-    arrays = {
-        "points": np.asarray(keypoints.points, np.float32),
-        "confidences": np.asarray(keypoints.confidences, np.float32),
-        "set": keypoints.set.name,
-        "names": np.asarray(list(names), np.str_),
-    }
-    if Path(path).suffix != ".npz":
-        raise ValueError(f"{path}: expected a name ending in .npz")
-    write_npz(path, arrays)
+
+    image: str | int
+    file: Path
+    people: tuple[Float[np.ndarray, "k 3"], ...]
+    size: tuple[int, int] | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Detections:
+    """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at +0.5.
+
+    set: None if no image has a person.
+    """
+
+    set: KeypointSet | None
+    images: tuple[DetectedImage, ...]
+    offset: float = HALF_PIXEL
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Source:
+    """What a reader of a format gets."""
+
+    path: Path
+    """The file."""
+    name: str
+    """Of the image or video that it may be of: the path in its folder without the suffix."""
+    alone: bool
+    """Whether no other file is read with it: the frames of a video are known by their number, else by name/number."""
+
+    @functools.cached_property
+    def json(self) -> Any:
+        """The value of the file, None for an npz archive. Raises: CaptureError."""
+        return None if self.path.suffix == ".npz" else checked_json(self.path)
+
+
+def detections_of(images: Sequence[DetectedImage]) -> Detections:
+    """Images of people whose set is told by the number of their points. Raises: CaptureError for others, and for two sets."""
+    people = [(len(person), image) for image in images for person in image.people]
+    for count, image in people:
+        if count != people[0][0]:
+            problem = f"a person of {count} points, but another has {people[0][0]}: expected one set of keypoints"
+            raise CaptureError(image.file, f"image {image.image}", problem)
+    if people and people[0][0] not in SETS_BY_COUNT:
+        known = " or ".join(f"{count} ({each.name})" for count, each in SETS_BY_COUNT.items())
+        raise CaptureError(people[0][1].file, "keypoints", f"expected {known} points, got {people[0][0]}")
+    return Detections(SETS_BY_COUNT[people[0][0]] if people else None, tuple(images))
+
+
+def triples(value: Any, file: Path, field: str, count: int | None = None) -> Float[np.ndarray, "k 3"]:
+    """x, y and confidence of each point, from a flat list of them; null is NaN.
+
+    Raises: CaptureError if these are no numbers, or not 3 * count (any multiple of 3 if count is None).
+    """
+    array = file_numbers(value, file, field, nulls=True)
+    wanted = "a multiple of 3" if count is None else f"{3 * count} ({count} times x, y, confidence)"
+    if array.ndim != 1 or array.size % 3 or (count is not None and array.size != 3 * count):
+        raise CaptureError(file, field, f"expected a flat list of {wanted} numbers, got shape {array.shape}")
+    return array.reshape(-1, 3)

@@ -4,17 +4,17 @@ import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.formats import DetectedImage, Detections, read_detections
-from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.formats import KEYPOINTS
+from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Keypoints, Source
 from humangs_jax.data.keypoints.sets import COCO_17, KeypointSet
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
 """If no coordinate of any view reaches this many pixels, they are no pixels but shares of the image."""
@@ -42,13 +42,60 @@ class Person(NamedTuple):
     far_outside: int
 
 
+def read_detections(path: Path) -> Detections:
+    """The people in the images of a file or folder of one of the `KEYPOINTS`; its content decides which one.
+
+    A folder, with its sub-folders, is all of its JSON files together. Raises: CaptureError.
+    """
+    if not path.exists():
+        raise CaptureError(path, "", "no such file or folder")
+    files = sorted(file for file in walk(path) if file.suffix == ".json") if path.is_dir() else [path]
+    if not files:
+        raise CaptureError(path, "", f"no JSON file in this folder: expected those of {KEYPOINTS.listed()}")
+    images: list[DetectedImage] = []
+    tool: tuple[str, Path] | None = None
+    known: Detections | None = None
+    amount = 0
+    for file in files:
+        name = file.relative_to(path).with_suffix("").as_posix() if path.is_dir() else file.stem
+        source = Source(file, name, alone=len(files) == 1)
+        amount += _amount(source.json)
+        check_limit("people", amount, "people and images")
+        if (format := KEYPOINTS.of_content(source)) is None:
+            raise CaptureError(file, "", f"no keypoints: expected those of {KEYPOINTS.listed()}")
+        if source.json != []:  # which several tools write where nobody is
+            tool = tool or (format.about, file)
+            if tool[0] != format.about:
+                problem = f"of {format.about}, but {tool[1].name} is of {tool[0]}: expected files of one tool"
+                raise CaptureError(file, "", problem)
+        found = format(source, format)
+        images += found.images
+        if found.set is not None:
+            known = known or found
+            if known.set is not found.set:
+                problem = f"{len(found.set.names)} points, but another file has {len(known.set.names)}"
+                raise CaptureError(file, "", f"{problem}: expected one set of keypoints")
+    return Detections(None, tuple(images)) if known is None else dataclasses.replace(known, images=tuple(images))
+
+
+def _amount(content: Any) -> int:
+    """How many people and images a JSON file has, before any is looked at."""
+    lists = [content]
+    if isinstance(content, dict):
+        lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info")]
+    entries = [entry for each in lists if isinstance(each, list) for entry in each]
+    keys = ("instances", "people")
+    inside = [entry[key] for entry in entries if isinstance(entry, dict) for key in keys if key in entry]
+    return 1 + len(entries) + sum(len(each) for each in inside if isinstance(each, list))
+
+
 def read_keypoints(
     path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None
 ) -> Keypoints:
     """Keypoints of one person in the views of a capture.
 
     Arguments:
-        path: a file or folder of one of the formats in `formats`.
+        path: a file or folder of one of the `KEYPOINTS`.
         names: of the capture's views. Images of the file are matched by name, or by the number in the name where the file
             has only numbers; images of no view are ignored.
         width, height: pixels of the capture's photos, which the keypoints have to be of; or of the photos of several sizes that

@@ -130,3 +130,5 @@ MEDIAPIPE_33 = _keypoint_set(
 
 KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67, MEDIAPIPE_33)}
 """The sets by name, as our npz files name them."""
+SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, COCO_WHOLEBODY_133)}
+"""The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""

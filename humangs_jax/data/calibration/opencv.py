@@ -1,0 +1,217 @@
+"""K, R and T of each camera: OpenCV's calibrations (FileStorage, YAML or JSON), AvatarReX, THuman4.0.
+
+A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a camera stand in a map of its own,
+`{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or beside those of others with its name behind: `K_01`, `dist_01`,
+`Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the list `names`, as in EasyMocap.
+
+FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a colon ({ x:1 }). Matrices are
+`!!opencv-matrix` with rows, cols, dt and data. https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.calibration.calibration import (
+    UNDISTORT_BEFORE,
+    CalibratedCamera,
+    Calibration,
+    Source,
+    brown_conrady,
+    image_size,
+    pose_matrix,
+    rotation,
+)
+from humangs_jax.data.capture_checks import CaptureError, checked_json, floats
+from humangs_jax.data.formats import CameraFormat
+from humangs_jax.io.reading import check_limit, limits, reading
+
+FISHEYE = ("fisheye", "is_fisheye", "equidistant")
+"""Values of `model` and the like, or keys that are true, of lenses with another formula."""
+SIZE_KEYS = ("imgSize", "image_size")
+
+
+def recognizes(source: Source) -> bool:
+    """Whether a file has K, R and T of cameras."""
+    if not (source.text.lstrip().startswith(("{", "%YAML", "---")) or source.path.suffix in (".yml", ".yaml")):
+        return False
+    values = parse_file_storage(source.text, source.path)
+    maps = (value for value in values.values() if isinstance(value, Mapping))
+    return bool(_names(values)) or any({"K", "R", "T"} & set(each) for each in maps)
+
+
+def read(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of one file. Raises: CaptureError naming the key."""
+    values, file = parse_file_storage(source.text, source.path), source.path
+    nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
+    if not nested:
+        return source.calibration(format, flat_cameras(values, values, (file, file), values.get("names")))
+    before = lambda name: lambda key: f"{name}.{key}"
+    cameras = [_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
+    return source.calibration(format, cameras)
+
+
+def flat_cameras(
+    inner: Mapping[str, Any], outer: Mapping[str, Any], files: tuple[Path, Path], names: Iterable[object] | None
+) -> list[CalibratedCamera]:
+    """Cameras whose names stand behind their keys. inner, outer: intrinsic and extrinsic values, of these files.
+
+    names: of the cameras; None: those that have a K. Raises: CaptureError naming file and key.
+    """
+    names = list(names or _names(inner))
+    if not names:
+        raise CaptureError(files[0], "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME")
+    behind = lambda name: lambda key: f"{key}_{name}"
+    own = lambda values, name: _of_camera(values, name, names)
+    return [_camera(str(name), own(inner, name), own(outer, name), files, behind(name)) for name in names]
+
+
+def _names(values: Mapping[str, Any]) -> list[str]:
+    return [key[2:] for key in values if key.startswith("K_")]
+
+
+def _of_camera(values: Mapping[str, Any], name: object, names: list[Any]) -> dict[str, Any]:
+    """`K_01: ..` of all cameras -> `K: ..` of one. `dist_a_1` is of camera a_1, if there is one, and not of camera 1."""
+    end = f"_{name}"
+    longer = tuple(f"_{other}" for other in names if len(str(other)) > len(str(name)))
+    own = {key: value for key, value in values.items() if key.endswith(end) and not key.endswith(longer)}
+    return {key[: -len(end)]: value for key, value in own.items()}
+
+
+def _camera(
+    name: str, inner: Mapping[str, Any], outer: Mapping[str, Any], files: tuple[Path, Path], field: Callable[[str], str]
+) -> CalibratedCamera:
+    """A camera of its intrinsic and extrinsic values, and their files. `field` makes keys those of the file, for errors."""
+    inner_file, outer_file = files
+    turn_key = "Rot" if "Rot" in outer else "R"  # EasyMocap has both: the matrix and the rotation vector
+    for key, values, file in (("K", inner, inner_file), (turn_key, outer, outer_file), ("T", outer, outer_file)):
+        if key not in values:
+            raise CaptureError(file, field(key), "missing")
+    turn = rotation(outer[turn_key], outer_file, field(turn_key))
+    translation = floats(outer["T"], outer_file, field("T"), (3,))
+    K = floats(inner["K"], inner_file, field("K"), (3, 3))
+    distortion = _distortion(inner, inner_file, field)
+    width, height = _size(inner, inner_file, field)
+    return CalibratedCamera(name, K, pose_matrix(turn, translation), width, height, distortion)
+
+
+def _distortion(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> Float[np.ndarray, "5"] | None:
+    """The coefficients of `D`, `dist`, `distCoeff`, ...; lenses that they do not describe are refused."""
+    coefficients = None
+    for key, value in values.items():
+        fisheye = value.lower() in FISHEYE if isinstance(value, str) else key.lower() in FISHEYE and bool(value)
+        if fisheye:
+            raise CaptureError(file, field(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
+        if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
+            coefficients = brown_conrady(value, file, field(key))
+    return coefficients
+
+
+def _size(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> tuple[int | None, int | None]:
+    for key in SIZE_KEYS:
+        if key in values:
+            return image_size(values[key], file, field(key))
+    for pair in (("width", "height"), ("W", "H")):
+        if all(key in values for key in pair):
+            return image_size([values[key] for key in pair], file, field(pair[0]))
+    return None, None
+
+
+# FileStorage -----------------------------------------------------------------------------------------------------------
+
+MATRIX = "opencv-matrix"
+YAML_TAG = "tag:yaml.org,2002:"
+"""What `!!` stands for."""
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
+"""A key of a flow map with its value right behind the colon."""
+
+
+def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
+    """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
+    try:
+        if text.lstrip().startswith("{"):
+            values = _matrices(checked_json(file, text), file, "")
+        else:
+            with reading(file, "YAML file", CaptureError):
+                check_limit("slow_text_bytes", len(text), "characters of YAML")
+            kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
+            root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
+            values = {} if root is None else _value(root, file)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise CaptureError(file, "", f"not readable as YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise CaptureError(file, "", "expected keys with values")
+    return values
+
+
+class _Loader(yaml.SafeLoader):
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node; no aliases, which a small file can nest to billions of values."""
+        if self.check_event(yaml.AliasEvent):
+            where = self.get_event().start_mark
+            raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
+        self.depth += 1
+        if self.depth > limits().nesting:
+            raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=self.peek_event().start_mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def _value(node: yaml.Node, file: Path) -> Any:
+    """The value of a node; numbers are read here, because YAML takes the camera's name 01 for one."""
+    if isinstance(node, yaml.ScalarNode):
+        value = _scalar(node.value) if node.style is None else node.value
+    elif isinstance(node, yaml.SequenceNode):
+        value = [_value(item, file) for item in node.value]
+    else:
+        value = {str(key.value): _value(item, file) for key, item in node.value}
+    if node.tag in yaml.SafeLoader.yaml_constructors:
+        return value
+    return _matrix(value, node.tag.removeprefix(YAML_TAG), file, f"line {node.start_mark.line + 1}")
+
+
+def _scalar(text: str) -> int | float | str | None:
+    """A number, .Nan, .Inf, None or a string."""
+    if text.lower() in (".nan", ".inf", "-.inf"):
+        return float(text.lower().replace(".", ""))
+    if NUMBER.fullmatch(text) and not re.fullmatch(r"[+-]?0\d+", text):
+        return int(text) if re.fullmatch(r"[+-]?\d+", text) else float(text)
+    return text if text not in ("", "~", "null") else None
+
+
+def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "rows columns"]:
+    if tag != MATRIX:
+        raise CaptureError(file, where, f"type {tag!r} is not supported: expected {MATRIX}")
+    try:
+        return np.asarray(value["data"], np.float64).reshape(int(value["rows"]), _columns(value))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CaptureError(file, where, f"not a matrix of rows, cols, dt and data: {error}") from error
+
+
+def _columns(value: Mapping[str, Any]) -> int:
+    """Columns times channels; dt is "d", or "3d" with three channels."""
+    channels = re.match(r"\d*", str(value["dt"]))
+    return int(value["cols"]) * int(channels[0] if channels and channels[0] else 1)
+
+
+def _matrices(value: Any, file: Path, field: str) -> Any:
+    """JSON values with the maps that stand for matrices replaced by arrays."""
+    if isinstance(value, list):
+        return [_matrices(item, file, field) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if "type_id" in value:
+        return _matrix(value, value["type_id"], file, field)
+    return {key: _matrices(item, file, f"{field}.{key}".lstrip(".")) for key, item in value.items()}

@@ -1,0 +1,48 @@
+"""OpenPose's --write_json: NAME_keypoints.json, {people: [{pose_keypoints_2d, hand_left_keypoints_2d, ...}]}, a file an image."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture_checks import CaptureError, expect, members
+from humangs_jax.data.formats import SourceFormat
+from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Source, triples
+from humangs_jax.data.keypoints.sets import OPENPOSE_67
+
+SUFFIX = "_keypoints"
+"""What OpenPose adds to the name of the image."""
+PARTS = {"pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
+"""The face, if it is there, is not read."""
+OTHER_MODELS = {18: "COCO", 15: "MPI", 135: "BODY_135"}
+"""By their number of points."""
+
+
+def recognizes(source: Source) -> bool:
+    """Whether a file is a JSON object with people."""
+    return isinstance(source.json, dict) and "people" in source.json
+
+
+def read(source: Source, format: SourceFormat) -> Detections:
+    """The people of one image. Raises: CaptureError."""
+    (entries,) = members(source.json, source.path, people=list)
+    people = tuple(_person(entry, source.path, f"people[{i}]") for i, entry in enumerate(entries))
+    image = DetectedImage(source.name.removesuffix(SUFFIX), source.path, people)
+    return Detections(OPENPOSE_67 if people else None, (image,))
+
+
+def _person(person: Any, file: Path, field: str) -> Float[np.ndarray, "67 3"]:
+    members(person, file, field, pose_keypoints_2d=list)
+    return np.concatenate([_part(person.get(key, []), file, f"{field}.{key}", n) for key, n in PARTS.items()])
+
+
+def _part(values: Any, file: Path, field: str, count: int) -> Float[np.ndarray, "k 3"]:
+    """The points of the body or of a hand; an empty list means that it was not detected."""
+    if not expect(values, list, file, field):
+        return np.zeros((count, 3))
+    found = len(values) // 3
+    if count != 21 and found in OTHER_MODELS:
+        problem = f"the {found} points of the model {OTHER_MODELS[found]}: expected BODY_25 (--model_pose BODY_25)"
+        raise CaptureError(file, field, problem)
+    return triples(values, file, field, count)
