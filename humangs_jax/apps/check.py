@@ -310,7 +310,7 @@ def _fit_label(examination: Examination, view: int) -> str:
     return f"{fit.name}  {f'{fit.median:.1f} px' if fit.keypoints else 'no keypoints'}"
 
 
-def _ticks(highest: float, count: float, whole: bool = False) -> Float[np.ndarray, " n"]:
+def _ticks(highest: float | int, count: float | int, whole: bool = False) -> Float[np.ndarray, " n"]:
     """Round numbers from 0 to `highest`, about `count`."""
     rough = highest / count
     power = 10.0 ** np.floor(np.log10(rough))
@@ -366,7 +366,7 @@ def limits_table(capture: Capture) -> str:
     return "\n".join(lines)
 
 
-def _range(low: float | None, high: float | None, unit: str) -> str:
+def _range(low: float | int | None, high: float | int | None, unit: str) -> str:
     if low is None and high is None:
         return "any that was tried"
     if low == high:

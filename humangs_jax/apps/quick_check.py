@@ -94,8 +94,7 @@ def likely_mistakes(capture: Capture) -> tuple[str, ...]:
 def faults(capture: Capture) -> tuple[tuple[str, ...], tuple[ViewFault, ...]]:
     """What is wrong with a capture as a whole, a line each, and with every view."""
     views = _Views.of(capture, capture.view_count)
-    of_each = tuple(_fault(views, i) for i in range(capture.view_count))
-    return (_faults_of_all(views)[0] if any(each.problem for each in of_each) else ()), of_each
+    return _faults_of_all(views)[0], tuple(_fault(views, i) for i in range(capture.view_count))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -192,9 +191,7 @@ def _fault(views: _Views, i: int) -> ViewFault:
     if mask is not None and not mask.any():
         return ViewFault("the mask is empty", inside)
     if inside < LEAST_INSIDE:
-        problem = (
-            "most of the body is outside the frame" if inside else "the body is behind the camera or outside the frame"
-        )
+        problem = "most of the body is outside the frame, or behind the camera"
     elif height < LEAST_HEIGHT:
         problem = "the body is tiny, in metres it would not be"
     elif own is not None and own < LEAST_IOU:

@@ -186,7 +186,7 @@ def test_warnings_tell_what_is_wrong(tmp_path):
         return " | ".join(check_capture(capture(**arrays), tmp_path / "check.png").views[0].warnings)
 
     behind = np.asarray(cameras()[0].center) * 3
-    assert "the body is behind the camera" in warnings(translations=behind[None])
+    assert "or behind the camera" in warnings(translations=behind[None])
     assert "outside the frame" in warnings(translations=np.array([[0.0, 5.0, 0.0]]))
     assert "body and mask do not agree" in warnings(translations=np.array([[0.0, 0.7, 0.0]]))
     assert "the body is tiny, in metres" in warnings(translations=-50 * behind[None])

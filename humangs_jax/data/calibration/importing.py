@@ -217,7 +217,9 @@ def _named_masks(
     return None, f"{named}: no such mask, {first}: imported without masks"
 
 
-def _check_options(scale: float, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
+def _check_options(
+    scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None
+) -> None:
     if not 0 < scale < float("inf"):
         raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
     for name, word, known in (
@@ -345,7 +347,7 @@ def _is_transparent(photo: Path) -> bool:
     if not read_checked(has_alpha, photo):
         return False
     alpha = read_checked(read_image, photo)[1]
-    return alpha is not None and alpha.min() < 1
+    return alpha is not None and bool(alpha.min() < 1)
 
 
 def _rewrite(
