@@ -3,7 +3,7 @@
     python experiments/render_tables.py [--check]
 
 Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds (format:
-`experiments/common/results.py`). --check writes nothing; exit status 1 if a page differs from its JSON files, if a section has
+`experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its JSON files, if a section has
 no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ... `<!-- end -->` becomes the formats that the package reads.
 """
 
@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from experiments.common.results import REPOSITORY, SECTION, rendered, write_text
+from experiments.results import REPOSITORY, SECTION, pages, rendered, write_text
 
 FORMATS = re.compile(r"(?<=<!-- formats: )(?P<name>\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
@@ -32,7 +32,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
     """Renders README.md and docs/*.md; returns what is wrong, one line each."""
     results, faults, shown = repository / "docs" / "results", [], set()
     known = {path.stem for path in results.glob("*.json")}
-    for page in [repository / "README.md", *sorted((repository / "docs").rglob("*.md"))]:
+    for page in pages(repository):
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
         faults += [f"{page.name}: no docs/results/{name}.json for its table" for name in names if name not in known]

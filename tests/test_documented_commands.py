@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import importlib
 import io
 import json
 import shutil
@@ -16,6 +17,7 @@ from bvh_files import CMU, write_bvh
 from command_line import run, save_tiny_avatar
 from documented import PAGES, ROOT, Command, commands_in, commands_of, filled, split_shell
 
+from experiments.harness import listed, parser_of
 from humangs_jax import cli
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
@@ -141,7 +143,7 @@ def test_documented_scripts_exist_and_take_their_options(tmp_path):
     ours = [command for command in SCRIPTS if command.words[1] not in FOREIGN]
     assert [str(command) for command in ours if not (ROOT / command.words[1]).is_file()] == []
     asked = [command for command in with_options() if not command.words[1].startswith(HEAVY)]
-    assert len(asked) > 3 and wrong_scripts(asked, tmp_path) == []
+    assert asked and wrong_scripts(asked, tmp_path) == []
 
 
 @pytest.mark.slow  # they import jax before they look at their options
@@ -149,6 +151,15 @@ def test_documented_scripts_that_import_much_take_their_options(tmp_path):
     asked = [command for command in with_options() if command.words[1].startswith(HEAVY)]
     assert len(asked) > 3 and wrong_scripts(asked, tmp_path) == []
     assert list(tmp_path.iterdir()) == []  # none has begun its work
+
+
+def test_documented_experiments_exist_and_take_their_options():
+    known, asked = listed(), [command for command in COMMANDS if command.words[1:3] == ("-m", "experiments")]
+    for command in (command for command in asked if len(command.words) > 3):
+        name, *options = command.words[3:]
+        assert name in known, command
+        if command.whole or options:
+            parser_of(getattr(importlib.import_module(known[name][0]), name))[0].parse_args(filled(options))
 
 
 def test_documented_runs_of_the_tests_name_what_exists():

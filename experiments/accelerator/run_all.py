@@ -176,7 +176,7 @@ def demo_scene(count: int, size: int) -> tuple[Any, Any]:
     import jax.numpy as jnp
     import numpy as np
 
-    from experiments.splatting.scenes import load_scene
+    from experiments.scenes import load_scene
     from humangs_jax.rendering.gaussians import Gaussians
 
     scene = load_scene("demo", size)
@@ -197,7 +197,7 @@ def splatting(arguments: argparse.Namespace) -> Iterator[Measurement]:
         import jax
         import jax.numpy as jnp
 
-        from experiments.common.interleaved import medians
+        from experiments.timing import medians
         from humangs_jax.rendering.splatting import plan_buffers, render
 
         gaussians, camera = demo_scene(count, size)
@@ -264,7 +264,7 @@ def frames(arguments: argparse.Namespace) -> Iterator[Measurement]:
     """Frames of an animation a second, and people made on the fly a second."""
     import jax
 
-    from experiments.common.interleaved import medians
+    from experiments.timing import medians
 
     size, people, batches = (64, 1, (1,)) if arguments.tiny else (512, 8, (1, 8, 32))
 
@@ -306,7 +306,7 @@ def batch_sizes(arguments: argparse.Namespace) -> Iterator[Measurement]:
     def measure(batch):
         import jax
 
-        from experiments.common.interleaved import medians
+        from experiments.timing import medians
         from experiments.training.cases import Case
         from humangs_jax.core.compiling import compiler_options
 

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.costs import costs_of, temporary_mb
 from experiments.common.results import markdown_table, publish, write_json
+from experiments.costs import costs_of, temporary_mb
 
 VARIANTS = {
     "kept": {},

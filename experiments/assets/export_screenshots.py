@@ -204,7 +204,7 @@ def main() -> None:
     sheets = [name for name in wanted if name in SHEETS]
     if sheets and arguments.modules is None:
         parser.error(f"{sheets[0]} needs --modules")
-    from experiments.common import chromium
+    from experiments import chromium
 
     if (reason := chromium.missing()) is not None:
         parser.error(reason)
@@ -231,7 +231,7 @@ def write_viewer(path: Path, folder: Path, avatar: Path) -> None:
     import numpy as np
     from PIL import Image
 
-    from experiments.common import chromium
+    from experiments import chromium
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.viewer.page import write_page
 

@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="iterations of timing; 0: none")
     add_outputs(parser, "video")
     arguments = parser.parse_args()
-    from experiments.common.interleaved import prepare_process
+    from experiments.timing import prepare_process
 
     prepare_process()
     from humangs_jax.avatar.avatar import Avatar
@@ -195,7 +195,7 @@ def measure(avatar: "Avatar", motion: "Motion", size: int, repeats: int) -> dict
 
     import numpy as np
 
-    from experiments.common.interleaved import medians
+    from experiments.timing import medians
     from humangs_jax.avatar.frames import draw, motion_views, splatting_of, without_unseen
     from humangs_jax.avatar.shot import Shot
 

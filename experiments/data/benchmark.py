@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.interleaved import prepare_process
 from experiments.common.results import markdown_table, publish, significant, write_json
 from experiments.data import made_up
+from experiments.timing import prepare_process
 
 INPUTS, TARGETS, SIZE = 4, 3, 256
 REAL_SIZES = {"avatarrex": (1500, 2048), "thuman4": (1330, 1150), "actorshq": (750, 1022)}

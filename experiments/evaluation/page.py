@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 if TYPE_CHECKING:
-    from experiments.common.chromium import Chromium
+    from experiments.chromium import Chromium
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.body.model import BodyPose
     from humangs_jax.geometry.camera import Camera
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20, help="images that are timed")
     add_outputs(parser, "page")
     arguments = parser.parse_args()
-    from experiments.common.chromium import Chromium, missing
+    from experiments.chromium import Chromium, missing
 
     if reason := missing():
         parser.error(reason)

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
-from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
 from humangs_jax.avatar.sheets import tile

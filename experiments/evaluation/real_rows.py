@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from experiments.common.results import markdown_table, write_json
-from experiments.evaluation.options import shipped_digest
 from experiments.evaluation.real_cameras import camera_errors, reference_cameras, seen_from, to_reference
 from experiments.evaluation.real_capture import (
     PACKAGE,
@@ -33,6 +32,7 @@ from experiments.evaluation.real_people import (
     video_sizes,
     without_calibration,
 )
+from experiments.subjects import shipped_digest
 from humangs_jax.apps.held_out import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct

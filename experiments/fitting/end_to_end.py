@@ -49,7 +49,7 @@ def run(arguments) -> None:
     from tqdm import tqdm
 
     from experiments.common.results import markdown_table, publish, write_json
-    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+    from experiments.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
     from humangs_jax.io.reading import read_json
     from humangs_jax.network.weights import load_weights

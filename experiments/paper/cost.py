@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.costs import costs_of, temporary_mb
-from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import REPOSITORY, add_outputs, markdown_table, significant, write_outputs
+from experiments.costs import costs_of, temporary_mb
 from experiments.paper.bench import ANIMATION, FASTER_MODELLING, OURS
+from experiments.timing import medians, prepare_process
 
 TABLE = "paper_cost"
 PATCH, READ_OPERATIONS = 8, 8

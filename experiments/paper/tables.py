@@ -27,7 +27,6 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import check_section, markdown_table, publish, significant, write_json
-from experiments.evaluation.results import file_digest
 from experiments.paper.bench import (
     ABLATIONS,
     ANIMATION,
@@ -50,6 +49,7 @@ from experiments.paper.bench import (
     triple,
     untrained_on_the_page,
 )
+from experiments.subjects import file_digest
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.io.reading import read_json
 

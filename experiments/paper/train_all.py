@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
     import jax
 
     from experiments.common.results import check_section, publish, write_json
-    from experiments.evaluation.results import file_digest
+    from experiments.subjects import file_digest
     from humangs_jax.data.datasets.bodies import FileBody
     from humangs_jax.data.loader import CaptureCache, find_captures
     from humangs_jax.people.bank import load_bank

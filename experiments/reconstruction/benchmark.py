@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.costs import temporary_mb
-from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import add_outputs, markdown_table, publish, write_outputs
+from experiments.costs import temporary_mb
 from experiments.reconstruction.cases import (
     benchmark_inputs,
     compiled,
@@ -33,6 +32,7 @@ from experiments.reconstruction.cases import (
     matmul_program,
     random_variables,
 )
+from experiments.timing import medians, peak_rss_mb, prepare_process
 
 MEBI = 1 / 2**20
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.costs import costs_of
+from experiments.costs import costs_of
 
 DISTANCE_FACTOR = 1.8
 """The nearest of the published protocol (1.8 to 2.2)."""

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.costs import temporary_mb
-from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import add_outputs, markdown_table, write_outputs
+from experiments.costs import temporary_mb
 from experiments.reconstruction.benchmark import configured
 from experiments.reconstruction.cases import benchmark_inputs, compiled, foreground, random_variables
+from experiments.timing import medians, prepare_process
 
 
 def main() -> None:

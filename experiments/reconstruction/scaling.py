@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 from experiments.reconstruction.cases import benchmark_inputs, compiled, foreground, random_variables
+from experiments.timing import medians, prepare_process
 
 WIDTH, LAYERS = 384, 6
 COLORS = {"all": "#c0392b", "foreground": "#1f6f8b"}

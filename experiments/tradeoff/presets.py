@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.interleaved import prepare_process
 from experiments.common.results import REPOSITORY, markdown_table
+from experiments.timing import prepare_process
 
 CLOSE, DECIBELS = 0.2, 0.3
 

@@ -28,10 +28,9 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.interleaved import prepare_process, timed
 from experiments.common.results import write_json
-from experiments.evaluation.options import shipped_digest
-from experiments.evaluation.results import TASKS
+from experiments.subjects import TASKS, shipped_digest
+from experiments.timing import prepare_process, timed
 
 SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
@@ -118,7 +117,7 @@ def described(point) -> dict[str, Any]:
 
 def person_of(seed: int, body, folder: Path | None):
     """A person with photos and held-out views; rendered once where there is a folder to keep them in."""
-    from experiments.evaluation.subjects import EvaluationSubject, HeldOut, make_evaluation_subject, ring_positions
+    from experiments.subjects import EvaluationSubject, HeldOut, make_evaluation_subject, ring_positions
     from humangs_jax.data.capture import load_capture, save_capture
 
     place = folder / str(seed) if folder else None
@@ -173,7 +172,7 @@ class Bench:
 
     def made(self, point, i):
         """The avatar of a point; those that only differ in how they are drawn are made once."""
-        from experiments.evaluation.refinement import random_start
+        from experiments.refinement import random_start
         from humangs_jax.apps.settings import reconstruct_with
         from humangs_jax.evaluation.cases import painted_body
         from humangs_jax.refinement.refine import refine_with_report
@@ -197,7 +196,7 @@ class Bench:
 
     def scores(self, point, avatar, person):
         """Scores by task, of frames brought to the size of the truth."""
-        from experiments.evaluation.subjects import score_tasks
+        from experiments.subjects import score_tasks
         from humangs_jax.avatar.frames import capture_views, draw
         from humangs_jax.evaluation.cases import draw_painted_body
         from humangs_jax.io.images import resized

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.costs import temporary_mb
-from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import markdown_table, publish, write_json
+from experiments.costs import temporary_mb
+from experiments.timing import medians, peak_rss_mb, prepare_process
 from experiments.training.cases import CASES, Case
 
 MEBI = 1 / 2**20

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments.common.costs import costs_of
+from experiments.costs import costs_of
 
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:

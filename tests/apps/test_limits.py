@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.check_limits import LIMITS, interval
+from experiments.robustness import LIMITS, interval
 from humangs_jax.apps import check as limits
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture

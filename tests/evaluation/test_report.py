@@ -5,7 +5,7 @@ import pytest
 from evaluation_cases import capture_from, random_views
 
 import humangs_jax as hg
-from experiments.common import chromium
+from experiments import chromium
 from humangs_jax.evaluation.cases import Case, Predicted
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))]

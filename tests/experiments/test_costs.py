@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 from jax.sharding import AxisType, PartitionSpec
 
-from experiments.common.costs import costs_of, temporary_mb
+from experiments.costs import costs_of, temporary_mb
 from humangs_jax.network.convolution import convolve
 
 N = 8

@@ -12,7 +12,11 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 TYPED = "training/train_shipped.py"
 """Its options are those of a configuration, which imports jax: run last."""
 SCRIPTS = sorted(
-    (path.relative_to(EXPERIMENTS).as_posix() for path in EXPERIMENTS.rglob("*.py") if "__main__" in path.read_text()),
+    (
+        path.relative_to(EXPERIMENTS).as_posix()
+        for path in EXPERIMENTS.rglob("*.py")
+        if 'if __name__ == "__main__"' in path.read_text()
+    ),
     key=lambda name: (name == TYPED, name),
 )
 DOCS = sorted((EXPERIMENTS.parent / "docs").glob("*.md"))

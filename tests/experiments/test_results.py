@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.results import blocks_of, json_text, publish, text_of
 from experiments.render_tables import render_pages
+from experiments.results import blocks_of, json_text, publish, text_of
 
 REPOSITORY = Path(__file__).parents[2]
 TABLE = "| run | PSNR | name |\n| --- | ---: | --- |\n| a | 1.0 | x |\n| b | 2.0 | y |"

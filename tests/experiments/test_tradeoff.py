@@ -2,7 +2,7 @@
 
 import json
 
-from experiments.common.results import REPOSITORY, blocks_of
+from experiments.results import REPOSITORY, blocks_of
 from experiments.splatting import tradeoff as splatting
 from experiments.tradeoff import report
 from experiments.tradeoff.points import points

@@ -514,7 +514,7 @@ def main():
 
 def write_page(page, figures):
     sys.path.insert(0, str(worker.ROOT))
-    from experiments.common.results import markdown_table, publish
+    from experiments.results import markdown_table, publish
 
     total = lambda key: sum(each[key] for each in figures.values())
     header = ["readers", "mutated files", "fewest of a reader", "read", "refused in one line", "anything else"]

@@ -177,7 +177,7 @@ def main():
 
 def publish_interrupts(page: Path, figures: dict[str, dict]) -> None:
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    from experiments.common.results import markdown_table, publish
+    from experiments.results import markdown_table, publish
 
     total = lambda key: sum(each[key] for each in figures.values())
     fewest = min(each["interrupted"] for each in figures.values())
@@ -190,7 +190,7 @@ def publish_interrupts(page: Path, figures: dict[str, dict]) -> None:
 
 def write_page(page: Path, figures: dict[str, dict]) -> None:
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    from experiments.common.results import markdown_table, publish
+    from experiments.results import markdown_table, publish
 
     total = lambda key: sum(each[key] for each in figures.values())
     header = ["commands that write", "changes of files in one run", "killed", "left a temporary name"]

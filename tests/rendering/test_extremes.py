@@ -1,7 +1,6 @@
 """Every extreme of docs/numerics.md, and random scenes over many decades: finite, and float32 close to float64."""
 
 import dataclasses
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +11,8 @@ from hypothesis import strategies as st
 from numpy_splatter import splat
 from rounding import bound
 
-from experiments.splatting import numerics
-from experiments.splatting import numerics_cases as cases
+from experiments import splatting_numerics as cases
+from experiments.harness import call
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.splatting import SplatConfig, render
 
@@ -214,16 +213,11 @@ def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
 
 
 @pytest.mark.parametrize("status", [0, 1])
-def test_the_script_writes_its_table_and_fails_on_a_bound(tmp_path, monkeypatch, capsys, status):
-    page = tmp_path / "numerics.md"
-    page.write_text("before\n<!-- table: splatting_numerics -->\nold\n<!-- end -->\nafter\n")
+def test_the_experiment_shows_its_table_and_fails_on_a_bound(monkeypatch, capsys, status):
     case = cases.CASES["opacity: 0"]
     outcome = cases.Outcome(True, 2 * case.image if status else 0.0, 0.0, 0.0, "K", 0.0, 0)
     exact = cases.dataclasses.replace(outcome, image=0.0)
     monkeypatch.setattr(cases, "measure", lambda case, in_float64=False: exact if in_float64 else outcome)
-    monkeypatch.setattr(sys, "argv", ["numerics.py", "--only", "opacity: 0", "--page", str(page)])
-    assert numerics.main() == status
-    text = page.read_text()
-    assert text.startswith("before") and text.endswith("after\n") and "old" not in text and "opacity: 0" in text
-    assert ("FAILED" in text) == (status == 1)
-    assert ("FAILED" in capsys.readouterr().out) == (status == 1)
+    assert call(cases.splatting_numerics, ["--only", "opacity: 0"]) == status
+    text = capsys.readouterr().out
+    assert "opacity: 0" in text and ("FAILED" in text) == (status == 1)

@@ -12,7 +12,7 @@ import pytest
 from bvh_files import CMU, MIXAMO, rest_frames, write_bvh
 from scipy.spatial.transform import Rotation
 
-from experiments.common import chromium
+from experiments import chromium
 from experiments.evaluation import page as evaluation
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody

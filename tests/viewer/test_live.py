@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from viewer_cases import small_avatar
 
-from experiments.common import chromium
+from experiments import chromium
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.viewer import live

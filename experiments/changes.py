@@ -1,13 +1,26 @@
 """Changes of a capture (other photos, masks, cameras, poses, bodies), and what `reconstruct` makes of it then.
 
-A `Change` takes a capture and gives another; `check_extremes.py` and `check_limits.py` list them by name.
+A `Change` takes a capture and gives another; `robustness.py` lists them by name.
 """
 
 import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
+
+from experiments.subjects import HeldOut, make_evaluation_subject, score_tasks
+from humangs_jax.apps.quick_check import likely_mistakes
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.geometry.quaternion import matrix_from_axis_angle
+from humangs_jax.io.images import resized
+from humangs_jax.people.seeds import seeds_of
+from humangs_jax.people.subject import make_subject
+from humangs_jax.people.writer import View, capture_views, sample_pose
 
 SEED_INDEX, SIZE, VIEWS = 1, 256, 4
 """The first person of the validation seeds that is taken, pixels, photos."""
@@ -16,19 +29,12 @@ Change = Callable[[Any], Any]
 
 def subjects(count: int) -> list[Any]:
     """People of the validation seeds, with held-out views of the pose of the photos."""
-    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
-    from humangs_jax.body.library import load_body
-    from humangs_jax.people.seeds import seeds_of
-
     body, seeds = load_body(), seeds_of("validation", SEED_INDEX, count)
     return [make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(4, 0, 0)) for seed in seeds]
 
 
 def photographed(seed: int, capture: Any) -> Any:
     """The capture of a synthetic person with new photos, from its cameras as they are now."""
-    from humangs_jax.people.subject import make_subject
-    from humangs_jax.people.writer import View, capture_views, sample_pose
-
     person = make_subject(seed, capture.body)
     views = [View(0, label, capture.cameras[i]) for i, label in enumerate(capture.names)]
     return capture_views(person, capture.body, [sample_pose(person, 0)], views)
@@ -39,11 +45,6 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
 
     reach: largest distance of a Gaussian from its vertex, in body heights. Raises: AssertionError: a number is not finite.
     """
-    from experiments.evaluation.subjects import score_tasks
-    from humangs_jax.apps.quick_check import likely_mistakes
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.evaluation.cases import draw_views
-
     try:
         avatar = reconstruct(*network, capture)
         drawn = draw_views(avatar, held_out)
@@ -105,11 +106,9 @@ def far(meters: float) -> Change:
     def moved(capture):
         distance = float(np.mean([np.asarray(m)[2, 3] for m in capture.cameras.cam_from_world]))
 
-        def back(m):
-            m[2, 3] += meters - distance
-            return m
-
-        return cameras(focal(meters / distance), back)(capture)
+        back = np.eye(4)
+        back[2, 3] = meters - distance
+        return cameras(focal(meters / distance), lambda m: back @ m)(capture)
 
     return moved
 
@@ -118,7 +117,6 @@ def zoom(factor: float) -> Change:
     """The person smaller or larger in the frame, cameras to match."""
 
     def changed(capture):
-        from humangs_jax.io.images import resized
 
         side = capture.images.shape[1]
         inner = max(1, round(side * min(factor, 1)))
@@ -229,10 +227,6 @@ def turned_by(degrees: float) -> Change:
     """Every camera turned about an axis of its own."""
 
     def changed(capture):
-        import jax.numpy as jnp
-
-        from humangs_jax.geometry.quaternion import matrix_from_axis_angle
-
         count = capture.view_count
         axes = noise(2, (count, 3))
         axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -264,9 +258,8 @@ def grown(pixels: int) -> Change:
     side = 2 * abs(pixels) + 1
 
     def changed(capture):
-        from scipy.ndimage import grey_dilation, grey_erosion
 
-        change = grey_dilation if pixels > 0 else grey_erosion
+        change = ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion
         found = np.stack([change(mask, (side, side)) for mask in capture.masks])
         inside = np.minimum(found, capture.masks)[..., None]
         true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(capture.masks[..., None], 1e-6)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.evaluation import body_cases as bodies
+from experiments import bodies
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body

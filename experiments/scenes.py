@@ -1,8 +1,8 @@
 """Scenes of Gaussians as files, what they should look like, and how far an image or a gradient is from that.
 
-A scene is an npz of float32 arrays: `means` (g,3) metres, `quats` (g,4) wxyz, `scales` (g,3) metres, `opacities` (g),
-`colors` (g,3), `cam_from_world` (4,4) OpenCV and `K_<size>` (3,3) for square images of that many pixels. The name `demo`
-stands for the person of the shipped demo capture, reconstructed, in the pose and before the camera of its first photo.
+A scene is an npz of float32 arrays: `means` (g,3) metres, `quats` (g,4) wxyz, `scales` (g,3) metres, `opacities` (g), `colors`
+(g,3), `cam_from_world` (4,4) OpenCV and `K_<size>` (3,3) for square images of that many pixels. "demo" stands for the person of
+the shipped demo capture, reconstructed, in the pose and before the camera of its first photo.
 
 A reference is an npz of `image` (size,size,3) on black, and, where it was made, `target_seed` and `grad_<parameter>`: the
 gradients of mean((image - target)^2) with target = numpy.random.default_rng(target_seed).random((size,size,3)).
@@ -10,13 +10,19 @@ gradients of mean((image - target)^2) with target = numpy.random.default_rng(tar
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-if TYPE_CHECKING:
-    from humangs_jax.geometry.camera import Camera
-    from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.avatar.animate import animate
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.geometry.camera import Camera, orbit
+from humangs_jax.network.weights import load_weights
+from humangs_jax.rendering.gaussians import Gaussians
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -36,18 +42,10 @@ class Scene(NamedTuple):
 
     def gaussians(self, dtype: type = np.float32) -> "Gaussians":
         """The five parameters on the device."""
-        import jax.numpy as jnp
-
-        from humangs_jax.rendering.gaussians import Gaussians
-
         return Gaussians(*(jnp.asarray(getattr(self, name), dtype) for name in PARAMETERS))
 
     def camera(self, dtype: type = np.float32) -> "Camera":
         """The camera on the device."""
-        import jax.numpy as jnp
-
-        from humangs_jax.geometry.camera import Camera
-
         return Camera(jnp.asarray(self.K, dtype), jnp.asarray(self.cam_from_world, dtype), self.size, self.size)
 
     def resized(self, size: int) -> "Scene":
@@ -97,10 +95,6 @@ def load_reference(path: str | Path, size: int) -> Reference:
 
 def orbiting(scene: Scene, azimuths: np.ndarray, elevations: np.ndarray | float = 0.0) -> "Camera":
     """Cameras (leading axis v) that look at a scene's middle from as far as its own does; radians."""
-    import jax.numpy as jnp
-
-    from humangs_jax.geometry.camera import orbit
-
     own, middle = scene.camera(), np.median(scene.means, axis=0)
     distance = float(np.linalg.norm(np.asarray(own.center) - middle))
     angles = (jnp.asarray(a, jnp.float32) for a in (azimuths, elevations))
@@ -140,13 +134,6 @@ def gradient_errors(found: np.ndarray, reference: np.ndarray) -> dict[str, float
 
 
 def _demo_scene(size: int) -> Scene:
-    import jax
-
-    from humangs_jax.avatar.animate import animate
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.photos import DEMO_CAPTURE
-    from humangs_jax.network.weights import load_weights
 
     capture = load_capture(DEMO_CAPTURE)
     avatar = reconstruct(*load_weights(), capture)

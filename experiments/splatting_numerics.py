@@ -1,4 +1,4 @@
-"""The extremes that splatting has to survive, as small scenes: shared by `splatting/numerics.py` and the tests.
+"""The extremes that splatting has to survive, as small scenes: is everything finite, and how far is float32 from float64?
 
 A case is a scene in float32 (or narrower), and bounds on how far its image and gradients may be from those of the same
 numbers in float64. Most scenes are 32 Gaussians in 24 x 16 pixels, so that one compilation serves nearly all of them.
@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import ALPHA_MIN, NEAR
 from humangs_jax.rendering.gaussians import Gaussians
@@ -426,3 +428,29 @@ def measure(case: Case, in_float64: bool = False) -> Outcome:
     """Draws one case in float32 (or float64) and by the reference in float64, and compares."""
     scene = case.build()
     return compare(scene, tiled_in_float64(scene) if in_float64 else tiled(scene), reference_in_float64(scene))
+
+
+@entry
+def splatting_numerics(run: Run, only: str = "") -> int:
+    """The extremes of splatting: is everything finite, and how far is float32 from float64?
+
+    Every case is rendered, with the gradients of a random loss with respect to everything, by the tiled renderer in float32 and
+    by the reference in float64 from the same numbers; and by the tiled renderer in float64, which shows that only rounding
+    remains. Exit status 1 if a number is not finite, a bound is exceeded, or something is visible that should not be. Three
+    minutes.
+
+    Options:
+    only: cases whose names contain this
+    """
+    rows, numbers, number = [], [], lambda x: "0" if x == 0 else f"{x:.0e}"
+    for name, case in CASES.items():
+        if only in name:
+            single, double = measure(case), measure(case, in_float64=True)
+            passes = single.passes(case) and max(double.image, double.gradient) <= FLOAT64
+            numbers.append({"case": name, "image_bound": case.image, "gradient_bound": case.gradient, "passes": passes})
+            numbers[-1] |= {"float32": dataclasses.asdict(single), "float64": dataclasses.asdict(double)}
+            rows.append(
+                [name + ("" if passes else " **FAILED**"), number(single.image), number(single.gradient), single.worst]
+            )
+    run.show(markdown_table(("case", "image error", "gradient error", "of"), rows), numbers)
+    return 0 if rows and all(row["passes"] for row in numbers) else 1

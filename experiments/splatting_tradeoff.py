@@ -1,45 +1,22 @@
-"""What each knob of the splatting renderer gains in time and costs in accuracy, and the Pareto front of their settings.
+"""What each knob of the splatting renderer gains in time and costs in accuracy, and the Pareto front of their settings."""
 
-    python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--image OUT.png]
-        [--page docs/performance.md]
-    python experiments/splatting/tradeoff.py --scene demo --image docs/images/splatting_tradeoff.png
-    python experiments/splatting/tradeoff.py --measured docs/results/splatting_tradeoff.json --image IMAGE
-
-Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its
-error is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise)
-the relative L2 error, the worst of the five parameters'. Knobs that only say in which order the work is done (tile size,
-block, chunks) are measured too: their error is rounding. Dropping the hidden: the Gaussians that weigh less than a
-threshold on every pixel from all of 24 cameras around are left out (of gradients, they count as 0).
-
-About 8 minutes for a scene of 52,375 Gaussians at 512; `--only radius_sigma scale` measures some knobs. Expected: the preset
-near_exact above 50 dB at 0.8 of the time, fast at about 40 dB and 0.6 of it (docs/performance.md).
-"""
-
-import argparse
 import dataclasses
 import gc
 import json
-import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.interleaved import prepare_process, timed
-from experiments.common.results import add_outputs, markdown_table, write_outputs
-from experiments.splatting.benchmark import DIRECTIONS, compiled
-from experiments.splatting.scenes import (
-    PARAMETERS,
-    Scene,
-    gradient_errors,
-    image_errors,
-    load_scene,
-    make_target,
-    orbiting,
-)
+from experiments.harness import Run, entry, figure
+from experiments.results import markdown_table
+from experiments.scenes import PARAMETERS, Scene, gradient_errors, image_errors, load_scene, make_target, orbiting
+from experiments.splatting import DIRECTIONS, compiled
+from experiments.timing import timed
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SPLAT_PRESETS, SplatConfig
+from humangs_jax.rendering.splatting import plan_buffers, render, render_views
 
 KNOBS: dict[str, tuple[Any, ...]] = {
     "tile_size": (4, 16),
@@ -91,36 +68,42 @@ class Setting(NamedTuple):
     dropped: np.ndarray | None = None
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", help="npz of a scene, or 'demo'")
-    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, or in docs/results, instead of a scene")
-    parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
-    parser.add_argument("--repeats", type=int, default=9, help="timed iterations")
-    parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
-    add_outputs(parser, "splatting_tradeoff")
-    parser.add_argument("--image", "--picture", type=Path, help="draw the Pareto front here")
-    parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
-    arguments = parser.parse_args()
-    if bool(arguments.scene) == bool(arguments.measured):
-        parser.error("give either --scene or --measured")
-    if arguments.measured:
-        result = json.loads(arguments.measured.read_text())
-        if "blocks" in result:
-            result = result["numbers"] or of_table(result["blocks"])
+@entry
+def splatting_tradeoff(
+    run: Run,
+    scene: str = "demo",
+    size: int = 512,
+    repeats: int = 9,
+    only: tuple[str, ...] = (),
+    image: Path | None = None,
+    measured: Path | None = None,
+) -> None:
+    """What each knob of the splatting renderer gains in time and costs in accuracy.
+
+    Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its error
+    is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise) the
+    relative L2 error, the worst of the five parameters'. Dropping the hidden: the Gaussians that weigh less than a threshold on
+    every pixel of 24 cameras around are left out. 8 minutes for 52,375 Gaussians.
+
+    Options:
+    scene: npz of a scene, or "demo"
+    size: side of the image, pixels
+    repeats: timed iterations
+    only: knobs to measure (also: hidden, combined, preset)
+    image: draw the Pareto front here
+    measured: docs/results/splatting_tradeoff.json of an earlier run, for the image alone
+    """
+    if measured:
+        result = json.loads(measured.read_text())["numbers"]
     else:
-        prepare_process()
-        result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
-    write_outputs(arguments, arguments.section, table(result), result)
-    if arguments.image:
-        draw(result, arguments.image)
+        result = measure(load_scene(scene, size), repeats, only or None)
+        run.show(table(result), result)
+    if image:
+        plot(image, result)
 
 
 def settings(scene: Scene, only: Sequence[str] | None) -> list[Setting]:
     """All points to measure but the exact one."""
-    from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-
     weights = largest_weights(scene) if only is None or {"hidden", "combined"} & set(only) else None
     found = [Setting("preset", name, config) for name, config in SPLAT_PRESETS.items() if name != "exact"]
     for knob, values in KNOBS.items():
@@ -144,9 +127,6 @@ def short(value: Any) -> str:
 
 def largest_weights(scene: Scene) -> np.ndarray:
     """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene, and of its own."""
-    from humangs_jax.rendering.splat_config import SplatConfig
-    from humangs_jax.rendering.splatting import render, render_views
-
     gaussians, config = scene.gaussians(), SplatConfig(visibility=True)
     own = render(gaussians, scene.camera(), config).visibility
     turns = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
@@ -157,11 +137,6 @@ def largest_weights(scene: Scene) -> np.ndarray:
 
 def measure(scene: Scene, repeats: int, only: Sequence[str] | None = None) -> dict[str, Any]:
     """{"scene", "size", "exact": milliseconds and errors, "settings": [one dict each]}."""
-    import jax
-
-    from humangs_jax.rendering.splat_config import DEFAULT_CONFIG
-    from humangs_jax.rendering.splatting import plan_buffers
-
     target = make_target(scene.size)
     fitted = lambda scene, config, dtype: plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, 1.0)
     with jax.enable_x64(True):
@@ -251,49 +226,18 @@ def table(result: dict[str, Any]) -> str:
     return f"{title}\n\n{markdown_table(header, rows)}"
 
 
-def of_table(blocks: Sequence[Any]) -> dict[str, Any]:
-    """The result behind a section of a page, as exact as its digits: for runs of which no other numbers were kept."""
-    title, shown = blocks
-    (_, *times, psnr, largest, gradients), *rows = shown["rows"]
-    errors = lambda *cells: dict(zip(("psnr", "max_abs_error", "gradient_relative_l2"), map(float, cells), strict=True))
-    exact = {name: {"cpu_ms": float(x.split()[0])} for name, x in zip(DIRECTIONS, times, strict=True)}
-    settings = []
-    for label, *times, psnr_, largest_, gradients_ in rows:
-        preset = label.strip("*") if label.startswith("*") else None
-        knob = "preset" if preset else "combined" if "," in label else label.split()[0]
-        relative = {f"{name}_cpu": float(x) for name, x in zip(DIRECTIONS, times, strict=True)}
-        settings.append({"knob": knob, "label": preset or label} | relative | errors(psnr_, largest_, gradients_))
-    ((scene, gaussians, size),) = re.findall(r"^(\w+), ([\d,]+) Gaussians at (\d+);", title)
-    counts = {"scene": scene, "gaussians": int(gaussians.replace(",", "")), "size": int(size)}
-    return counts | {"exact": exact | errors(psnr, largest, gradients), "settings": settings}
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def plot(path: Path, result: dict[str, Any]) -> None:
     """Time relative to exact against PSNR, forward and forward+backward, with the front."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     exact = {**result["exact"], "label": "exact", "knob": "preset"} | {f"{name}_cpu": 1.0 for name in DIRECTIONS}
     rows = [exact] + [r for r in result["settings"] if r["knob"] not in SCHEDULE and r["label"] != "inria"]
-    figure, axes = plt.subplots(1, 2, figsize=(13, 6), sharex=True, sharey=True)
-    for axis, name in zip(axes, DIRECTIONS, strict=True):
-        _draw_panel(axis, rows, f"{name}_cpu")
-        axis.set(xlabel=f"{name.replace('_', ' + ')}: CPU time relative to exact")
-        axis.grid(alpha=0.25)
-    axes[0].set_ylabel("PSNR to the exact image, dB")
-    axes[1].legend(fontsize=8, loc="upper left")
-    axes[1].set_xlim(right=1.1)
-    figure.suptitle(
-        f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets. "
-        "Grey: the fronts, with and without leaving hidden Gaussians out",
-        fontsize=10,
-    )
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, 2, (13, 6)) as axes:
+        for axis, name in zip(axes, DIRECTIONS, strict=True):
+            _draw_panel(axis, rows, f"{name}_cpu")
+            axis.set(xlabel=f"{name.replace('_', ' + ')}: CPU time relative to exact", xlim=(None, 1.1))
+        axes[0].set_ylabel("PSNR to the exact image, dB")
+        axes[1].legend(fontsize=8, loc="upper left")
+        title = f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets. Grey: the fronts"
+        axes[0].set_title(title + ", with and without leaving hidden Gaussians out", fontsize=8, loc="left")
 
 
 def _draw_panel(axis, rows, time):
@@ -314,7 +258,3 @@ def _draw_panel(axis, rows, time):
         elif row["knob"] != "combined":  # what is combined: see the table
             text = row["label"].removeprefix(row["knob"]).strip()
             axis.annotate(text, point, (5, -8), textcoords="offset points", fontsize=6.5, color="0.35")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

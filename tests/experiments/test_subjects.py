@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.evaluation import subjects as people
+from experiments import subjects as people
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture

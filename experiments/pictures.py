@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.evaluation.results import TASK_NAMES, TASKS, extremes
-from experiments.evaluation.subjects import Drawn, task_views
+from experiments.subjects import TASKS, Drawn, task_views
 from humangs_jax.avatar.sheets import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import to_uint8, write_png
@@ -35,34 +34,31 @@ def strip_of(drawn: Drawn, held_out: Capture) -> Strip:
     return strips
 
 
-def write_sheet(path: Path, report: dict[str, Any], strips: Mapping[int, Strip]) -> None:
+def write_sheet(
+    path: Path, shown: tuple[Sequence[int], Sequence[int]], rows: Mapping[int, Any], strips: Mapping[int, Strip]
+) -> None:
     """The best people on the left, the worst on the right: one row each, both tasks, PSNR of the person's views above.
 
-    strips: by seed, of at least the people of `extremes`.
+    shown: the best and the worst, by seed. rows, strips: scores by task and images of at least these.
     """
-    best, worst = extremes(report)
-    half = {"best": best, "worst": worst} if worst else {"best": best}
-    sheets = [_half(name, people, str(report["views"]), strips) for name, people in half.items()]
+    halves = [(name, seeds) for name, seeds in zip(("best", "worst"), shown, strict=True) if seeds]
+    sheets = [_half(name, seeds, rows, strips) for name, seeds in halves]
     gap = np.ones((sheets[0].shape[0], 6 * GAP, 3))
     write_png(path, np.concatenate([x for sheet in sheets for x in (sheet, gap)][:-1], axis=1))
 
 
-def _half(name: str, people: Sequence[dict[str, Any]], count: str, strips: Mapping[int, Strip]) -> np.ndarray:
-    tasks = [task for task in TASKS if task in strips[people[0]["seed"]]]
+def _half(name, seeds, rows, strips):
+    tasks = [task for task in TASKS if task in strips[seeds[0]]]
     images, labels = [], []
-    for row in people:
+    for seed in seeds:
         for task in tasks:
-            scores = row["by_views"][count][task]
-            images += [cropped(image) for image in strips[row["seed"]][task]]
-            labels += [
-                f"seed {row['seed']}",
-                f"ours {scores['psnr']:.1f} dB",
-                f"painted {scores['baseline_psnr']:.1f} dB",
-            ]
+            scores = rows[seed][task]
+            images += [cropped(image) for image in strips[seed][task]]
+            labels += [f"seed {seed}", f"ours {scores['psnr']:.1f} dB", f"painted {scores['baseline_psnr']:.1f} dB"]
     sheet = tile(np.stack(images) / 255, labels=labels, columns=len(TRIPLE) * len(tasks))
     strip = np.ones((TITLE + 2 * GAP, sheet.shape[1], 3))
     width = sheet.shape[1] // len(tasks)
-    titles = [(f"{name}: {TASK_NAMES[task]}", GAP + i * width, GAP, width - GAP) for i, task in enumerate(tasks)]
+    titles = [(f"{name}: {TASKS[task]}", GAP + i * width, GAP, width - GAP) for i, task in enumerate(tasks)]
     return np.concatenate([write_texts(strip, titles, TITLE), sheet])
 
 
@@ -101,34 +97,9 @@ def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
     return np.stack(squares)
 
 
-def plot_views(path: Path, report: dict[str, Any]) -> None:
-    """Mean PSNR of the whole image and of the person alone against the number of photos, ours and the painted body."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    counts = list(report["by_views"])
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4))
-    for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole picture", "on the person"), strict=True):
-        for task, color in zip(TASKS, ("C0", "C1"), strict=True):
-            for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "painted body")):
-                if all(task in report["by_views"][count] for count in counts):
-                    values = [report["by_views"][count][task][prefix + key] for count in counts]
-                    label = f"{name}: {TASK_NAMES[task]}"
-                    axis.plot([int(count) for count in counts], values, style, ms=4, color=color, label=label)
-        axis.set(xlabel="photos", ylabel="PSNR, dB", title=title, xticks=[int(count) for count in counts])
-        axis.grid(alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.tight_layout(rect=(0, 0.15, 1, 1))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def write_triples(
     path: Path,
-    images: Mapping[int, Sequence[np.ndarray]],
+    images: Mapping[Any, Sequence[np.ndarray]],
     across: int = 2,
     headers: tuple[str, ...] = ("truth", "feed-forward", "refined"),
 ) -> None:

@@ -1,20 +1,26 @@
-"""A person to evaluate on: photos from a ring of cameras, and held-out views of the same pose and of others.
+"""People to evaluate on: who they are, their photos and held-out views, the network, and what their rows depend on.
 
-The ring has `RING` cameras of the published protocol around the person, evenly spaced but for the generator's jitter, number 0
-the most frontal one. N photos are every (RING / N)-th camera of the ring, so each person is rendered once for all numbers of
-photos. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_person` for the same seed, and images
-have 8 bits as they would have on disk.
+Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the generator's jitter, number 0 the
+most frontal one. N photos are every (RING / N)-th camera, so each person is rendered once for all numbers of photos. Held-out
+cameras and unseen poses are those of `humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
+
+A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos, and in poses that no photo
+shows; means over views, under the protocol "humangs".
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.evaluation.results import TASKS, Scores
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
@@ -24,16 +30,128 @@ from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
+from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
+from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.rendering import PosedSubject
+from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of
 from humangs_jax.people.subject import SyntheticSubject, make_subject
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12
 """Cameras that photos are taken from; numbers of photos divide it."""
+TASKS = {"novel": "new views, same pose", "animation": "new views, unseen poses"}
+Scores = dict[str, float | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class People:
+    """Options:
+    subjects: how many people
+    held_out: views to compare with, in the pose of the photos
+    poses: unseen poses
+    pose_views: views to compare with, of each unseen pose
+    size: side of the photos in pixels
+    first: index of the first person within the split
+    split: seeds of the people; choices are made on "validation"
+    weights: weights file; the shipped ones if not given
+    tokens: patches that the network looks at; as it was trained if not given
+    crop: photos are cut to the person first
+    loosest_of: of so many people, those in the loosest clothes
+    skinning_reach: metres; other reach of the skinning between the legs than the weights'; 0: by its own vertex alone
+    lpips_backbone: weights of the network under LPIPS, which is missing without them
+    lpips_heads: heads of LPIPS, where the backbone's file does not have them
+    lpips_net: which network that is
+    """
+
+    subjects: int = 8
+    held_out: int = 8
+    poses: int = 2
+    pose_views: int = 4
+    size: int = 256
+    first: int = 0
+    split: Literal["test", "validation"] = "test"
+    weights: Path | None = None
+    tokens: Literal["all", "foreground"] | None = None
+    crop: bool = False
+    loosest_of: int | None = None
+    skinning_reach: float | None = None
+    lpips_backbone: Path | None = None
+    lpips_heads: Path | None = None
+    lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
+
+    def start(self) -> "Start":
+        """Reads what is needed. Raises: ValueError that names the option that is out of range."""
+        if min(self.subjects, self.held_out, self.pose_views) < 1 or min(self.first, self.poses) < 0:
+            raise ValueError(
+                "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0"
+            )
+        if self.loosest_of is not None and self.loosest_of < self.subjects:
+            raise ValueError(f"--loosest-of must be at least --subjects, {self.subjects}")
+        if self.skinning_reach is not None and self.skinning_reach < 0:
+            raise ValueError("--skinning-reach must be at least 0")
+        lpips = load_loss_networks(None, self.lpips_backbone, self.lpips_heads, self.lpips_net).lpips
+        body, (variables, config) = load_body(), load_weights(self.weights)
+        if (reach := self.skinning_reach) is not None:
+            config = config.with_conventions(skinning_reach=reach or None)
+        config = config.with_runtime(tokens=self.tokens, crop=self.crop)
+        seeds = list(seeds_of(self.split, self.first, self.loosest_of or self.subjects))
+        if self.loosest_of is not None:
+            loose = [looseness(make_subject(seed, body), body) for seed in seeds]
+            seeds = [seeds[i] for i in sorted(np.argsort(loose)[-self.subjects :])]
+        given = {name: getattr(self, name) for name in ("loosest_of", "skinning_reach")} | {"crop": self.crop or None}
+        settings = {name: value for name, value in given.items() if value is not None} | {
+            "weights": file_digest(self.weights) if self.weights else shipped_digest(SHIPPED),
+            "tokens": config.tokens,
+            "split": self.split,
+            "image_size": self.size,
+            "held_out": self.held_out,
+            "poses": self.poses,
+            "pose_views": self.pose_views,
+            "ring": RING,
+            "generator": GENERATOR_VERSION,
+            "lpips_net": self.lpips_net if lpips else None,
+            "lpips_weights": file_digest(self.lpips_backbone) if lpips and self.lpips_backbone else None,
+        }
+        held_out = HeldOut(self.held_out, self.poses, self.pose_views)
+        return Start(body, variables, config, seeds, held_out, self.size, lpips, settings)
+
+
+class Start(NamedTuple):
+    """What an evaluation begins with. settings: what the rows depend on."""
+
+    body: BodyModel
+    variables: Variables
+    config: HumanGSConfig
+    seeds: list[int]
+    held_out: "HeldOut"
+    size: int
+    lpips: Lpips | None
+    settings: dict[str, Any]
+
+    def about(self) -> str:
+        """What was measured, in one line."""
+        s = self.settings
+        return (
+            f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
+            f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in unseen poses; "
+            f"weights {s['weights'][:12]}, tokens: {s['tokens']}."
+        )
+
+
+def shipped_digest(asset: str) -> str:
+    """SHA-256 of a file of the package."""
+    with resources.as_file(resources.files("humangs_jax").joinpath(asset)) as path:
+        return file_digest(path)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclasses.dataclass(frozen=True)

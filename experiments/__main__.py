@@ -1,0 +1,7 @@
+"""`python -m experiments`: see `harness.py`."""
+
+import sys
+
+from experiments.harness import main
+
+sys.exit(main())

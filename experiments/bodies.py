@@ -1,0 +1,224 @@
+"""The same weights, people and photos on other bodies: the default one, a made-up one in SMPL-X's format, and decimated ones."""
+
+import dataclasses
+import functools
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry, means
+from experiments.quality import COLUMNS, cells
+from experiments.results import markdown_table
+from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.sheets import contact_sheet
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
+from humangs_jax.network.config import HumanGSConfig
+
+SMPLX_SEED_VERTICES = 3493
+"""Vertices of the decimated body that the made-up one grows from: with a vertex for each of its faces about SMPL-X's 10,475."""
+FRACTIONS = {"1/4": 4, "1/16": 16}
+POSE_FEATURES = 9 * (len(JOINT_NAMES) - 1)
+PAINTED = "painted default body"
+
+
+@entry
+def evaluation_bodies(run: Run, people: People = People(8), views: int = 4, images: Path | None = None) -> None:
+    """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and fewer vertices.
+
+    "SMPL-X format": a made-up body of another topology, written as an SMPL-X file and read by its loader; the poses go to its
+    joints by name. "1/4" and "1/16" of the default body's vertices, as they are and with long edges split as the weights want
+    it. Costs are seconds of compiled programs: photos to avatar, without choosing the body's vertices, which is done once a
+    body; posing and drawing one image. About 10 s of CPU time a person, and some minutes of compiling.
+
+    Options:
+    views: photos that the network sees
+    images: the truth and every body's image of the first person
+    """
+    if views < 1 or RING % views:
+        raise ValueError(f"--views: expected a number that divides {RING}, got {views}")
+    start = people.start()
+    settings = start.settings | {"views": views, "device": jax.devices()[0].device_kind}
+    cases, config = body_cases(start.body, start.config), as_it_is(start.config)
+
+    def measure(seed):
+        subject = make_evaluation_subject(seed, start.body, [views], start.size, start.held_out)
+        truth, drawn = subject.held_out, {"truth": subject.held_out.images}
+        row: dict[str, Any] = {
+            PAINTED: score_tasks(draw_painted_body(painted_body(subject.inputs(views)), truth), truth, start.lpips)
+        }
+        for name, case in cases.items():
+            other = subject.with_body(case.carrier)
+            inputs = other.inputs(views)
+            make = lambda inputs=inputs: jax.block_until_ready(reconstruct(start.variables, config, inputs))
+            avatar, passes = timed(make)
+            drawn[name], frames = timed(lambda avatar=avatar, other=other: draw_views(avatar, other.held_out).images)
+            seconds = {"reconstruct": passes, "frame": [x / truth.view_count for x in frames]}
+            costs = {
+                f"{step}{mark}": x for step, pair in seconds.items() for mark, x in zip(("", "_cpu"), pair, strict=True)
+            }
+            costs["gaussians"] = len(avatar.gaussians.means)
+            row[name] = score_tasks(drawn[name], truth, start.lpips) | {"costs": costs}
+        return row, drawn
+
+    people_rows = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
+    rows = list(run.rows(people_rows, settings, again=bool(images)).values())
+    if images:
+        shown = [0, start.held_out.views] if start.held_out.poses else [0]
+        drawn = run.pictures[str(start.seeds[0])]
+        tiles = np.stack([pictures[view] for view in shown for pictures in drawn.values()])
+        contact_sheet(tiles, images, headers=list(drawn), columns=len(drawn))
+    bodies = means(
+        [{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows]
+    )
+    for name, case in cases.items():
+        bodies[name] |= {"body_vertices": len(case.body.template), "vertices": len(case.carrier.template)}
+        each = [row[name]["costs"] for row in rows]
+        bodies[name]["costs"] = {key: float(np.median([costs[key] for costs in each])) for key in each[0]}
+    how = f"{views} photos. Medians of the seconds over people, compiled programs, device: {settings['device']}."
+    numbers = {"bodies": bodies, "settings": settings, "people": len(rows)}
+    run.show(f"{start.about()} {how}\n\n{bodies_table(bodies)}", numbers)
+
+
+def timed(work: Callable[[], Any]) -> tuple[Any, tuple[float, float]]:
+    """The result, and the seconds, by the clock and of CPU time, of the second of two runs: the first may compile."""
+    work()
+    clock, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    return result, (time.perf_counter() - clock, time.process_time() - cpu)
+
+
+def bodies_table(bodies: dict[str, Any]) -> str:
+    """A row a body, what it costs and how well it matches."""
+    tasks = [task for task in TASKS if task in bodies[PAINTED]]
+    keys = [key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
+    header = [
+        "body",
+        "vertices",
+        "that carry Gaussians",
+        "Gaussians",
+        "reconstruct: wall, CPU s",
+        "frame: wall, CPU ms",
+    ]
+    header += [f"{TASKS[task]}: {COLUMNS[key][0]}" for task in tasks for key in keys]
+    table = []
+    for name, body in bodies.items():
+        facts = ["-"] * 5
+        if costs := body.get("costs"):
+            seconds = ", ".join(f"{costs[key]:.2f}" for key in ("reconstruct", "reconstruct_cpu"))
+            milliseconds = ", ".join(f"{1e3 * costs[key]:.0f}" for key in ("frame", "frame_cpu"))
+            facts = [body["body_vertices"], body["vertices"], int(costs["gaussians"]), seconds, milliseconds]
+        table.append([name, *facts, *(number for task in tasks for number in cells(body[task], keys))])
+    return markdown_table(header, table)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BodyCase:
+    """A body, and the one on whose vertices the Gaussians hang."""
+
+    body: BodyModel
+    carrier: BodyModel
+
+
+def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
+    """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its vertices.
+
+    Decimated bodies are included unchanged and, if the weights want long edges split, also with split edges.
+    """
+    wanted = {"default": body, "SMPL-X format": smplx_body(body)}
+    cases = {name: BodyCase(model, gaussian_body(model, config)) for name, model in wanted.items()}
+    for name, divisor in FRACTIONS.items():
+        small = decimate(body, len(body.template) // divisor)
+        cases[name] = BodyCase(small, small)
+    if config.conventions.longest_edge is not None:
+        for name in FRACTIONS:
+            small = cases[name].body
+            cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config))
+    return cases
+
+
+def as_it_is(config: HumanGSConfig) -> HumanGSConfig:
+    """The configuration for a body whose vertices carry the Gaussians as they are."""
+    return config.with_conventions(body_vertices=None, longest_edge=None)
+
+
+def smplx_body(body: BodyModel) -> BodyModel:
+    """The same people on another mesh, written as an SMPL-X model file and read from it."""
+    made = turned_subdivision(decimate(body, min(SMPLX_SEED_VERTICES, len(body.template))))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "SMPLX_MADE_UP.npz"
+        write_smplx(file, made)
+        return load_body(file, shape_count=body.shape_directions.shape[-1], expression_count=0)
+
+
+def turned_subdivision(body: BodyModel) -> BodyModel:
+    """Another mesh of the same body: a vertex in the middle of each face, and each edge turned to join two of them.
+
+    That is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing; no inner edge of the old mesh is left, and the
+    old vertices have their numbers. Joints stay those of the old vertices in every shape. Texture coordinates are dropped.
+    """
+    faces = np.asarray(body.faces, np.int64)
+    n = len(body.template)
+    tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    middles = n + np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(tails * n + heads)
+    opposite = heads * n + tails
+    place = np.minimum(np.searchsorted((tails * n + heads)[order], opposite), len(order) - 1)
+    twin = order[place]
+    inner = (tails * n + heads)[twin] == opposite
+    across = np.where(inner, middles[twin], heads)  # at a rim the face keeps its edge
+    # each side gives the triangle at its own tail; its twin gives the one at the other end
+    turned = np.stack([tails, across, middles], axis=-1)
+    names = ("template", "shape_directions", "pose_directions", "skinning_weights")
+    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    grown = {name: np.concatenate([x, x[faces].mean(axis=1)]) for name, x in linear.items()}
+    return replace(
+        body,
+        **{name: jnp.asarray(x) for name, x in grown.items()},
+        faces=jnp.asarray(turned, body.faces.dtype),
+        joint_regressor=jnp.pad(body.joint_regressor, ((0, 0), (0, len(faces)))),
+        uvs=None,
+        uv_faces=None,
+        collapse_order=None,
+        collapse_into=None,
+    )
+
+
+def write_smplx(path: Path, body: BodyModel) -> None:
+    """A body with SMPL-X's joints as an SMPL-X model file: its shape directions, no expressions, no correctives if it has none.
+
+    Raises: ValueError if it has other joints, or more shape directions than the format holds.
+    """
+    count, n = body.shape_directions.shape[-1], len(body.template)
+    if body.joint_names != JOINT_NAMES:
+        raise ValueError(f"body '{body.name}' has other joints than SMPL-X")
+    if count > SHAPE_COLUMNS:
+        raise ValueError(f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}")
+    directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
+    directions[..., :count] = body.shape_directions
+    correctives = np.zeros((n, 3, POSE_FEATURES), np.float32) if body.pose_directions is None else body.pose_directions
+    parents = np.asarray(body.parents, np.int64) % 2**32  # the root's as the format has it
+    arrays = {
+        "v_template": body.template,
+        "f": np.asarray(body.faces, np.uint32),
+        "shapedirs": directions,
+        "posedirs": correctives,
+        "J_regressor": body.joint_regressor,
+        "weights": body.skinning_weights,
+        "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.uint32),
+    }
+    # no array is called allow_pickle, the stub's only other keyword
+    np.savez_compressed(path, **{key: np.asarray(x) for key, x in arrays.items()})  # ty: ignore[invalid-argument-type]

@@ -1,0 +1,354 @@
+"""What refinement gains, weights side by side, and README's tables, which are made of both."""
+
+import dataclasses
+import functools
+import itertools
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry, figure, means
+from experiments.pictures import cropped, details, frontal_view, write_triples
+from experiments.results import REPOSITORY, markdown_table, significant
+from experiments.subjects import TASKS, People, make_evaluation_subject, score_tasks, shipped_digest, task_views
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.core.pytree import replace
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.losses.metrics import semi_transparent
+from humangs_jax.refinement.config import ITERATIONS, RefineConfig
+from humangs_jax.refinement.learned import SHIPPED
+from humangs_jax.refinement.refine import refine_with_report
+
+DEGREES, SHAPES = 0.2, 0.02
+"""Of --off: turn of a joint and change of a shape coefficient (standard deviations) for each millimetre."""
+SHOWN = {
+    "psnr": ("PSNR", 2),
+    "psnr_fg": ("on the person", 2),
+    "psnr_boundary": ("boundary", 2),
+    "semi_transparent": ("semi_transparent", 3),
+}
+
+
+@entry
+def refinement(
+    run: Run,
+    people: People = People(8),
+    seconds: tuple[float, ...] = (1, 2, 5, 15),
+    sizes: tuple[int, ...] = (256, 512),
+    scored_at: int | None = None,
+    views: tuple[int, ...] = (4,),
+    starts: tuple[Literal["network", "random colors"], ...] = ("network",),
+    iterations: tuple[int, ...] = (0, ITERATIONS),
+    off: tuple[float, ...] = (0.0,),
+    refine_poses: bool = False,
+    longest_edge: float | None = None,
+    plot: Path | None = None,
+    sheet: Path | None = None,
+    details_sheet: Path | None = None,
+) -> None:
+    """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colors.
+
+    0 seconds are the start; seconds do not count compilation. One device: one core of a CPU. With --off, held-out views show the
+    pose of the photos and are drawn with the same wrong body.
+
+    Options:
+    seconds: lengths of the runs
+    sizes: sides of the photos in pixels (--size is not used)
+    scored_at: side of the held-out views in pixels; default: as the photos
+    views: numbers of photos
+    starts: what is refined; "random colors": as many round Gaussians on the body's surface
+    iterations: of the learned update; 0: Adam alone
+    off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2 degrees, shapes change by 0.02
+    refine_poses: the pose of each photo is refined, too
+    longest_edge: split the body's edges to this, metres
+    plot: PSNR against seconds
+    sheet: truth, feed-forward and the longest run of every person, largest size
+    details_sheet: the same of faces, hands, hems and shoes
+    """
+    start = people.start()
+    start = start._replace(config=start.config.with_runtime(longest_edge=longest_edge))
+    settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "starts": starts, "off": off}
+    settings |= {"iterations": iterations, "refine_poses": refine_poses, "longest_edge": longest_edge}
+    settings |= {"scored_at": scored_at} if scored_at else {}
+    settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
+
+    def measure(seed):
+        row, pictures = {}, None
+        for size in sizes:
+            subject = make_evaluation_subject(seed, start.body, views, size, start.held_out)
+            if scored_at:
+                scored = make_evaluation_subject(seed, start.body, views, scored_at, start.held_out)
+                subject = dataclasses.replace(subject, held_out=scored.held_out)
+            for count, wrong, begin, rounds in itertools.product(views, off, starts, iterations):
+                how = RefineConfig(iterations=rounds, poses=refine_poses)
+                cell, drawn = _refined(start, with_body_off(subject, wrong), count, begin, how, seconds)
+                also = f", {rounds} iterations" if rounds else ""
+                row[f"{size} {count} {begin}{also}" + (f", body {wrong:g} mm off" if wrong else "")] = cell
+                if begin == "network" and count == max(views):
+                    pictures = drawn
+        return row, pictures
+
+    cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
+    rows = list(run.rows(cases, settings, again=bool(sheet or details_sheet)).values())
+    numbers = refinement_means(rows)
+    run.show(
+        refinement_section(numbers, settings, len(rows)), {"settings": settings, "means": numbers, "people": len(rows)}
+    )
+    if sheet:
+        write_triples(sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in run.pictures.items()})
+    if details_sheet:
+        write_triples(details_sheet, {seed: close for seed, (_, close) in run.pictures.items()}, 1)
+    if plot:
+        plot_refinement(plot, numbers)
+
+
+def with_body_off(subject: Any, millimetres: float) -> Any:
+    """The person, whose photos and held-out views of the same pose come with a body that is off."""
+    if not millimetres:
+        return subject
+    rng, poses = np.random.default_rng(subject.seed), subject.photos.poses
+    off = lambda array, std: jnp.asarray(
+        np.asarray(array) + millimetres * std * rng.normal(size=array.shape), jnp.float32
+    )
+    rotations = off(poses.rotations[:1], np.radians(DEGREES))
+    poses = replace(poses, rotations=rotations, translation=off(poses.translation[:1], 1e-3))
+    betas = off(np.asarray(subject.photos.betas), SHAPES)
+    moved = lambda capture: dataclasses.replace(capture, poses=poses, betas=betas)
+    still = subject.held_out.select(task_views(subject.held_out)["novel"])
+    return dataclasses.replace(subject, photos=moved(subject.photos), held_out=moved(still))
+
+
+def _refined(start, subject, count, begin, how, seconds):
+    """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the front, whole and in details."""
+    inputs = subject.inputs(count)
+    avatar = reconstruct(start.variables, start.config, inputs)
+    if begin == "random colors":
+        avatar = random_start(avatar, subject.seed)
+    view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
+    scores, first = score_all(avatar, subject.held_out, view)
+    cell, last = {"0": scores}, first
+    for length in seconds:
+        refined = refine_with_report(avatar, inputs, dataclasses.replace(how, seconds=length))
+        scores, last = score_all(refined.avatar, subject.held_out, view)
+        about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
+        cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
+    drawn = (subject.held_out.images[view], first, last)
+    return cell, (drawn, [np.concatenate(list(details(image, subject.held_out, view)), axis=1) for image in drawn])
+
+
+def random_start(avatar: Any, seed: int) -> Any:
+    """Round Gaussians of random colors where the body's surface is, as many as the avatar has."""
+    rng, count = np.random.default_rng(seed), len(avatar.gaussians.means)
+    means = jnp.repeat(avatar.rest_vertices, count // len(avatar.rest_vertices), axis=0)
+    gaussians = replace(
+        avatar.gaussians,
+        means=means + jnp.asarray(0.005 * rng.normal(size=means.shape), jnp.float32),
+        quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)),
+        scales=jnp.full((count, 3), 0.01),
+        opacities=jnp.full(count, 0.5),
+        colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
+        low_pass=None,
+    )
+    return replace(avatar, gaussians=gaussians, light=None)
+
+
+def score_all(avatar: Any, held_out: Any, view: int = 0) -> tuple[dict[str, Any], np.ndarray]:
+    """Scores by task, also the semi-transparent foreground of the true images, and the image of a view."""
+    drawn = draw_views(avatar, held_out)
+    scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)
+    for task, views in task_views(held_out).items():
+        if task in scores:
+            true = [float(semi_transparent(mask, mask)) for mask in held_out.masks[views]]
+            scores[task]["semi_transparent_of_truth"] = sum(true) / len(true)
+    return scores, drawn.images[view]
+
+
+def refinement_means(rows: list[Any]) -> dict[str, Any]:
+    """{cell: {seconds: {task: mean scores, "least_gain": of any person}}} of people's rows."""
+    found = {}
+    for name, lengths in rows[0].items():
+        found[name] = {}
+        for seconds in lengths:
+            tasks = means(
+                [{task: row[name][seconds][task] for task in TASKS if task in lengths[seconds]} for row in rows]
+            )
+            gain = lambda row, name=name, seconds=seconds: (
+                row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
+            )
+            found[name][seconds] = tasks | {"least_gain": min(map(gain, rows))}
+    return found
+
+
+def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people: int) -> str:
+    """The table of the page."""
+    header = ["photos", "start", "seconds", "task", *(heading for heading, _ in SHOWN.values()), "least gain"]
+    rows = []
+    for name, lengths in numbers.items():
+        size, count, start = name.split(" ", 2)
+        for seconds, cell in lengths.items():
+            for task in (task for task in TASKS if task in cell):
+                scores = [f"{cell[task][key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
+                least = f"{cell['least_gain']:.2f}" if task == "novel" and seconds != "0" else ""
+                rows.append([f"{count} of {size} px", start, seconds, TASKS[task], *scores, least])
+    about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; least gain: of any person."
+    scored_at = settings.get("scored_at")
+    about += f" Views of {scored_at} px." if scored_at else ""
+    true = {
+        scored_at or name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
+        for name, lengths in numbers.items()
+        if "semi_transparent_of_truth" in lengths["0"]["novel"]
+    }
+    shares = ", ".join(f"{share:.3f} at {size} px" for size, share in true.items())
+    about += f" Semi-transparent foreground of the true images: {shares}." if true else ""
+    return f"{about}\n\n{markdown_table(header, rows, 'llll' + 'r' * (len(SHOWN) + 1))}"
+
+
+def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
+    """PSNR of the whole image and on the person against seconds."""
+    with figure(path, 2, (9, 3.6), legend=0.2) as axes:
+        for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole image", SHOWN["psnr_fg"][0]), strict=True):
+            for i, (name, lengths) in enumerate(numbers.items()):
+                size, count, start = name.split(" ", 2)
+                for task, style in zip(TASKS, ("o-", "s--"), strict=True):
+                    values = [cell[task][key] for cell in lengths.values() if task in cell]
+                    label = f"{count} photos of {size} px, {start}: {TASKS[task]}"
+                    axis.plot(
+                        [float(x) for x in lengths][: len(values)], values, style, ms=4, color=f"C{i}", label=label
+                    )
+            axis.set(xlabel="seconds", ylabel="PSNR, dB", title=title)
+            axis.set_xscale("symlog", linthresh=1)
+
+
+# Side by side --------------------------------------------------------------------------------------------------------
+
+MAY_DIFFER = ("weights", "tokens", "crop", "skinning_reach")
+COMPARED = {"psnr": 2, "psnr_fg": 2, "ssim": 4, "semi_transparent": 3}
+"""Scores, and their digits."""
+
+
+@entry
+def compare(run: Run, results: tuple[str, ...]) -> None:
+    """Weights, or two ways to use them, side by side, from the OUTs of `refinement` for each (--table names the table).
+
+    They may differ in --weights, --tokens, --crop and --skinning-reach.
+
+    Options:
+    results: NAME=OUT
+    """
+    named = dict(pair.split("=", 1) for pair in results)
+    found = {name: json.loads(Path(path).read_text()) for name, path in named.items()}
+    numbers = compared(found)
+    heads = {"psnr": "PSNR", "psnr_fg": "on the person", "ssim": "SSIM"}
+    tasks = {"novel": "same pose", "animation": "unseen poses"}
+    header = [
+        "weights",
+        "refined, s",
+        *(f"{title}: {heads.get(key, key)}" for title in tasks.values() for key in COMPARED),
+    ]
+    rows = [
+        [name, seconds, *(f"{scores[task][key]:.{digits}f}" for task in tasks for key, digits in COMPARED.items())]
+        for name, lengths in numbers.items()
+        for seconds, scores in lengths.items()
+    ]
+    score = lambda row, seconds: next(iter(row.values()))[seconds]["novel"]["psnr_fg"]
+    each = {
+        name: {seconds: [score(row, seconds) for row in found[name]["rows"].values()] for seconds in lengths}
+        for name, lengths in numbers.items()
+    }
+    run.show(markdown_table(header, rows), {"means": numbers, "people": each})
+
+
+def compared(results: dict[str, Any]) -> dict[str, Any]:
+    """{name: {seconds: {task: {score: mean}}}}.
+
+    Raises: ValueError if two results are not of the same people and settings, or one is of several starts.
+    """
+    common = [
+        ({key: value for key, value in result["settings"].items() if key not in MAY_DIFFER}, list(result["rows"]))
+        for result in results.values()
+    ]
+    numbers = {}
+    for (name, result), found in zip(results.items(), common, strict=True):
+        if found != common[0]:
+            raise ValueError(
+                f"{name}: expected the people and settings of {next(iter(results))}: {common[0]}, got {found}"
+            )
+        mean = refinement_means(list(result["rows"].values()))
+        if len(mean) != 1:
+            raise ValueError(f"{name}: expected one size, number of photos and start, got {list(mean)}")
+        numbers[name] = {
+            seconds: {task: {key: scores[task][key] for key in COMPARED} for task in TASKS}
+            for lengths in mean.values()
+            for seconds, scores in lengths.items()
+        }
+    return numbers
+
+
+# README --------------------------------------------------------------------------------------------------------------
+
+
+@entry
+def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
+    """README's tables of quality and of the demo's times, from two runs of the demo and from tables of the docs.
+
+    HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --out b; readme b/report.json --timed a/report.json
+    Times are those of an idle machine, from an empty compile cache.
+
+    Options:
+    refined: report of the refined demo
+    timed: report of the unrefined demo, nothing compiled before; without it times stay
+    """
+    paths = (REPOSITORY / "docs" / "results" / f"{name}.json" for name in ("evaluation_views", "refinement_32"))
+    people = [json.loads(path.read_text())["numbers"] for path in paths]
+    run.show(readme_quality(json.loads(refined.read_text()), *people), table="readme_quality")
+    if timed:
+        run.show(readme_times(json.loads(timed.read_text())), table="readme_demo")
+
+
+def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
+    """The demo person and the test people.
+
+    Raises: ValueError if the demo was not refined, or the people or the weights of the two tables are not the same.
+    """
+    if "refined" not in demo:
+        raise ValueError(
+            "the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0"
+        )
+    count = people["people"]
+    if refined["people"] != count:
+        raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
+    if people["settings"]["weights"] != refined["settings"]["weights"]:
+        raise ValueError("evaluation_views and refinement_32 are of different weights: measure them again")
+    by_size = {name.split()[0]: lengths for name, lengths in refined["means"].items()}
+    feed_forward = people["by_views"]["4"]["novel"]
+    rows = {
+        f"{count} synthetic people, 256 px, feed-forward": feed_forward,
+        "the same, refined for 1 s": by_size["256"]["1"]["novel"],
+        "512 px, refined for 1 s": by_size["512"]["1"]["novel"],
+        "512 px, refined for 1 s, in poses that no photo shows": by_size["512"]["1"]["animation"],
+        f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
+        "baseline: the painted body mesh, 256 px": {
+            name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "ssim", "psnr_fg")
+        },
+    }
+    columns = {"psnr": 1, "ssim": 3, "psnr_fg": 1}
+    shown = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
+    header = ["", "PSNR", "SSIM", "foreground PSNR"]
+    return markdown_table(header, [[name, *shown(scores)] for name, scores in rows.items()])
+
+
+def readme_times(demo: dict[str, Any]) -> str:
+    """Times of the demo's stages."""
+    spent, views = demo["timings"], demo["views"]
+    stages = {
+        f"reconstruct: {views['input']} photos of {demo['image_size'][0]} px -> {demo['gaussians']:,} Gaussians": "reconstruct",
+        "animate: one pose": "animate",
+        f"render {views['held_out']} views": "render_held_out",
+    }
+    seconds = lambda stage: [f"{spent[stage]['compile']:.1f} s", f"{significant(1000 * spent[stage]['run'])} ms"]
+    rows = [[name, *seconds(stage)] for name, stage in stages.items()]
+    whole = ["everything, files included, without refinement (`--refine 0`)", "", f"{demo['total_seconds']:.0f} s"]
+    return markdown_table(["stage", "compile", "run"], [*rows, whole], "lll")

@@ -1,0 +1,420 @@
+"""How far inputs and number types may go: extremes of each quantity, ranges of use, errors of every stage."""
+
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import changes
+from experiments.changes import (
+    VIEWS,
+    Change,
+    at_the_pelvis,
+    betas,
+    cameras,
+    far,
+    focal,
+    grown,
+    masks,
+    moved_by,
+    noise,
+    outcome,
+    person_of,
+    photographed,
+    photos,
+    poses,
+    random_turns,
+    spoilt,
+    tall,
+    turned,
+    turned_by,
+    without_weights,
+    zoom,
+)
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY, markdown_table, write_json
+from experiments.subjects import HeldOut, make_evaluation_subject
+from humangs_jax.avatar.reconstruct import fit_buffers
+from humangs_jax.body.library import load_body
+from humangs_jax.core.progress import bar
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.loader import Example
+from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.network import presets
+from humangs_jax.network.humangs import apply_humangs, init_humangs
+from humangs_jax.network.stages import Recorder
+from humangs_jax.network.weights import load_weights
+from humangs_jax.people.seeds import seeds_of
+from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.diagnose import observe_subject
+from humangs_jax.training.forward import draw_targets, white_backgrounds
+from humangs_jax.training.step import NO_NETWORKS
+
+# Extremes ------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """photos, held_out: changes of the captures that the avatar is made of and compared with. photographed: the person is
+    photographed anew, by the changed cameras. network: (variables, configuration) -> others.
+    """
+
+    photos: Change = lambda capture: capture
+    held_out: Change = lambda capture: capture
+    photographed: bool = False
+    network: Callable[[Any, Any], tuple[Any, Any]] = lambda variables, config: (variables, config)
+
+
+def weights(change: Callable[[Any], Any]) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Other variables."""
+    return lambda variables, config: (change(variables), config)
+
+
+def computed(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Another type of number for the encoder's products."""
+    return lambda variables, config: (variables, config.with_runtime(dtype=dtype))
+
+
+def in_type(dtype: str) -> Callable[[Any], Any]:
+    """All variables in another type of number."""
+    return lambda variables: jax.tree.map(lambda x: x.astype(dtype), variables)
+
+
+def nan_in(variables: Any) -> Any:
+    """NaN in one entry of the first array."""
+    leaves, structure = jax.tree.flatten(variables)
+    leaves[0] = np.array(leaves[0])
+    leaves[0].reshape(-1)[0] = np.nan
+    return jax.tree.unflatten(structure, leaves)
+
+
+NOISE = np.random.default_rng(0)
+CASES: dict[str, Case] = {
+    "as it is": Case(),
+    "4 stops over": Case(photos(lambda x: 16 * x)),
+    "4 stops under": Case(photos(lambda x: x / 16)),
+    "black": Case(photos(np.zeros_like)),
+    "white": Case(photos(np.ones_like)),
+    "noise": Case(photos(lambda x: NOISE.random(x.shape).astype(np.float32))),
+    "focal length x 2": Case(cameras(focal(2.0))),
+    "focal length / 2": Case(cameras(focal(0.5))),
+    "focal length x 10": Case(cameras(focal(10.0))),
+    "focal length / 10": Case(cameras(focal(0.1))),
+    "cameras inside the body": Case(at_the_pelvis),
+    "cameras at 100 m": Case(far(100.0), photographed=True),
+    "cameras look away": Case(cameras(matrix=turned)),
+    "person of 1 pixel": Case(zoom(1 / 150)),
+    "person of a twentieth of the frame": Case(zoom(0.06)),
+    "person cut at the frame": Case(zoom(3.0)),
+    "4 m tall": Case(tall(2.3), held_out=tall(2.3)),
+    "0.4 m tall": Case(tall(0.23), held_out=tall(0.23)),
+    "poses past joint limits": Case(poses(lambda x: 3 * x)),
+    "every joint at random": Case(poses(random_turns)),
+    "masks empty": Case(masks(np.zeros_like)),
+    "masks full": Case(masks(np.ones_like)),
+    "masks inverted": Case(masks(lambda x: 1 - x)),
+    "no masks": Case(lambda capture: dataclasses.replace(capture, masks=None)),
+    "1 view": Case(lambda capture: capture.select([0])),
+    "32 views": Case(lambda capture: capture.select(list(range(VIEWS)) * 8)),
+    "one view four times": Case(lambda capture: capture.select([0] * VIEWS)),
+    "skinning weights of 0": Case(without_weights),
+    "betas 0": Case(betas(0.0)),
+    "betas 100": Case(betas(100.0)),
+    "NaN in images": Case(spoilt("images")),
+    "NaN in masks": Case(spoilt("masks")),
+    "NaN in betas": Case(spoilt("betas")),
+    "NaN in K": Case(spoilt("cameras.K")),
+    "NaN in cam_from_world": Case(spoilt("cameras.cam_from_world")),
+    "NaN in rotations": Case(spoilt("poses.rotations")),
+    "NaN in translation": Case(spoilt("poses.translation")),
+    "NaN in the template of the body": Case(spoilt("body.template")),
+    "NaN in the shape directions": Case(spoilt("body.shape_directions")),
+    "NaN in the joint regressor": Case(spoilt("body.joint_regressor")),
+    "NaN in the skinning weights": Case(spoilt("body.skinning_weights")),
+    "infinity in betas": Case(spoilt("betas", np.inf)),
+    "NaN in the weights": Case(network=weights(nan_in)),
+    "NaN in a pose to be drawn": Case(held_out=spoilt("poses.rotations")),
+    "NaN in a camera that draws": Case(held_out=spoilt("cameras.K")),
+    "weights in bfloat16": Case(network=weights(in_type("bfloat16"))),
+    "weights in float16": Case(network=weights(in_type("float16"))),
+    "float16 compute": Case(network=computed("float16")),
+    "bfloat16 compute": Case(network=computed("bfloat16")),
+}
+
+
+@entry
+def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
+    """What `reconstruct` makes of inputs at the extremes: an error, a warning or an avatar, and how good that is.
+
+    One person of the validation seeds, four photos of 256 pixels; each case changes one thing. "warned": the quick check, which
+    `humangs reconstruct` runs first, says something. "reach": largest distance of a Gaussian from its vertex, in body heights;
+    all numbers have to be finite. PSNR: held-out views of the same pose, by the true cameras and pose. "error": a line names the
+    array.
+
+    Options:
+    cases: words; only cases whose names have one of them; the other rows of the table stay
+    """
+    (subject,), network = changes.subjects(1), load_weights()
+
+    def measure(case):
+        capture = case.photos(subject.inputs(VIEWS))
+        capture = photographed(subject.seed, capture) if case.photographed else capture
+        return outcome(case.network(*network), capture, case.held_out(subject.held_out))
+
+    chosen = [name for name in CASES if not cases or any(word in name for word in cases)]
+    numbers = run.rows({name: functools.partial(measure, CASES[name]) for name in chosen})
+    if cases and run.publish:
+        stored = json.loads((REPOSITORY / "docs/results" / f"{run.table}.json").read_text())["numbers"] | numbers
+        numbers = {name: stored[name] for name in CASES if name in stored}
+    rows = []
+    for name, row in numbers.items():
+        if "error" in row:
+            rows.append([name, "error", "", "", "", row["error"]])
+            continue
+        shown = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_fg']:.1f}"]
+        rows.append([name, "warned" if row["warnings"] else "avatar", *shown, (row["warnings"] or [""])[0]])
+    header = ["case", "result", "reach", "PSNR", "on the person", "first line"]
+    run.show(markdown_table(header, rows, "llrrrl"), numbers)
+
+
+# Ranges of use -------------------------------------------------------------------------------------------------------
+
+BOUND = 1.0
+"""Decibels of PSNR."""
+RENDERED = "distance of the cameras"
+"""The quantity with new photos from the cameras as they are changed."""
+LIMITS: dict[str, tuple[str, float | None, dict[float, Change]]] = {
+    "photos": ("", 4, {n: lambda c, n=n: c.select(list(range(0, VIEWS, VIEWS // n))) for n in (1, 2)}),
+    "noise": (
+        "standard deviation",
+        0,
+        {x: photos(lambda image, x=x: image + x * noise(4, image.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
+    ),
+    "distance of the cameras": ("m", None, {x: far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)}),
+    "height of the person": ("pixels of 256", None, {x: person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
+    "masks too large or small": ("pixels of 256", 0, {x: grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
+    "focal length": ("%", 0, {x: cameras(focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
+    "cameras turned": ("degrees", 0, {x: turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
+    "joints turned": (
+        "degrees",
+        0,
+        {x: poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
+    ),
+    "body moved": ("cm", 0, {x: moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
+    "shape coefficients": (
+        "standard deviations",
+        0,
+        {
+            x: lambda c, x=x: dataclasses.replace(
+                c, betas=np.asarray(c.betas) + np.float32(x * noise(6, c.betas.shape))
+            )
+            for x in (0.25, 0.5, 1, 2)
+        },
+    ),
+}
+"""{quantity: (unit, the value at which nothing is changed, {value: change})}. None: it is somewhere among the values."""
+
+
+@entry
+def limits(run: Run, people: int = 2) -> None:
+    """How far a quantity may be off, alone, until the mean PSNR of some people has fallen by 1 dB; writes assets/limits.json.
+
+    People of the validation seeds, four photos of 256 pixels; linear between the values tried. With --publish,
+    humangs_jax/assets/limits.json is written for `humangs check --limits`.
+
+    Options:
+    people: how many
+    """
+    network, chosen = load_weights(), changes.subjects(people)
+
+    def score(name, change):
+        scores = []
+        for subject in chosen:
+            capture = change(subject.inputs(VIEWS))
+            capture = photographed(subject.seed, capture) if name == RENDERED else capture
+            scores.append(outcome(network, capture, subject.held_out)["psnr"])
+        return float(np.mean(scores))
+
+    tried = {(name, value): change for name, (_, _, each) in LIMITS.items() for value, change in each.items()}
+    cases = {f"{name} {value:g}": functools.partial(score, name, change) for (name, value), change in tried.items()}
+    scores = run.rows({"plain": lambda: score("", lambda capture: capture)} | cases, {"people": people})
+    losses: dict[str, Any] = {}
+    for name, value in tried:
+        losses.setdefault(name, {})[value] = scores["plain"] - scores[f"{name} {value:g}"]
+    ranges, rows = {name: interval(name, losses[name]) for name in LIMITS}, []
+    for name, lost in losses.items():
+        ends = ["-" if ranges[name][end] is None else f"{ranges[name][end]:.3g}" for end in ("low", "high")]
+        values = ", ".join(f"{value:g}: {loss:.1f}" for value, loss in sorted(lost.items()))
+        rows.append([f"{name}, {ranges[name]['unit']}".rstrip(", "), *ends, values])
+    if run.publish:
+        write_json(REPOSITORY / "humangs_jax/assets/limits.json", {"bound": BOUND, "ranges": ranges})
+    header = ["quantity", "from", "to", "dB lost at each value tried"]
+    run.show(markdown_table(header, rows, "lrrl"), {"losses": losses, "ranges": ranges})
+
+
+def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
+    """The range around the best value in which the loss stays below `BOUND`; None for an end that was not reached."""
+    unit, zero, _ = LIMITS[name]
+    points = sorted((losses | ({} if zero is None else {zero: 0.0})).items())
+    middle = min(range(len(points)), key=lambda i: points[i][1])
+
+    def end(step):
+        i = middle
+        while 0 <= i + step < len(points):
+            (x, loss), (y, more) = points[i], points[i + step]
+            if more > BOUND:
+                return x + (y - x) * (BOUND - loss) / (more - loss)
+            i += step
+        return None
+
+    low, high = end(-1), end(1)
+    low = 0.0 if low is None and points[0][0] == 0 else low  # errors that have no sign
+    if name == "photos" and low is not None:
+        low = math.ceil(low)
+    return {"unit": unit, "low": low, "high": high}
+
+
+# Number types --------------------------------------------------------------------------------------------------------
+
+Types = Literal["float32", "tf32", "bfloat16", "float16"]
+COLUMNS = {"values": "value", "cotangents": "gradient sent back", "gradients": "gradient of parameters"}
+TARGETS = 2
+
+
+@entry
+def stability(
+    run: Run,
+    networks: tuple[Literal["shipped", "published"], ...] = ("shipped", "published"),
+    types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"),
+    seeds: int = 3,
+    published_size: int = 128,
+) -> None:
+    """Error of every stage, from photos to images and back to gradients, by number type, against float64 from the same numbers.
+
+    "shipped": the shipped weights on people of the validation seeds. "published": the published architecture with random weights,
+    drawn anew for every seed, on the demo person. An error is a relative L2 norm, the largest over the arrays of a stage and over
+    the seeds: of what the stage gives, of the gradients that it sends back, and of those of its parameters. float16 runs forward
+    only. tf32: float32 with products as the device's matrix units compute them; left out where the device has none.
+    Tables: TABLE_shipped, TABLE_published.
+
+    Options:
+    types: number types to compare
+    seeds: people, or draws of the weights
+    published_size: side of the published network's photos, pixels
+    """
+    for network in networks:
+        make = {"shipped": shipped_case, "published": published_case}[network]
+        cases = with_room([make(seed, published_size) for seed in range(seeds)])
+        worst = _worst(cases, [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
+        measured = list(next(iter(worst.values())))
+        columns = [(name, column) for name in measured for column in COLUMNS if name != "float16" or column == "values"]
+        show = lambda stage, name, column: (
+            f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+        )
+        rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
+        header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
+        run.show(markdown_table(header, rows), {"seeds": seeds} | worst, f"{run.table}_{network}")
+
+
+def _worst(cases, types):
+    """{stage: {type: {column: {"error", "of": the leaf that has it}}}}."""
+    worst: dict[str, Any] = {}
+    for case in bar(cases, desc="stability", unit="case"):
+        reference = observe(case, "float64")
+        for name in types:
+            for stage, columns in observe(case, name).items():
+                for column, arrays in columns.items():
+                    for leaf, array in arrays.items():
+                        truth = np.asarray(reference[stage][column][leaf], np.float64)
+                        error = relative_error(np.asarray(array, np.float64), truth)
+                        cell = worst.setdefault(stage, {}).setdefault(name, {})
+                        known = cell.get(column, {}).get("error", -1.0)
+                        if np.isnan(error) or known < error:  # NaN is the worst
+                            cell[column] = {"error": error, "of": leaf}
+    return worst
+
+
+def with_room(cases):
+    """The cases, each (variables, config, body, example), with one body and one token capacity: a program serves all."""
+    config, body = cases[0][1], gaussian_body(cases[0][2], cases[0][1])
+    size = config.conventions.image_size
+    examples = [Example(standardize(photos, size), standardize(targets, size)) for *_, photos, targets in cases]
+    fitted = [fit_buffers(prepare_inputs(body, example.inputs, config), config) for example in examples]
+    config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
+    return [(variables, config, body, example) for (variables, *_), example in zip(cases, examples, strict=True)]
+
+
+def relative_error(value, truth):
+    """Norm of the difference over that of the truth; 0 where both vanish."""
+    difference, norm = np.linalg.norm(value - truth), np.linalg.norm(truth)
+    return float(difference / norm) if norm else float(difference)
+
+
+def shipped_case(seed, _):
+    """Variables, configuration, body and example of a person of the validation seeds."""
+    body, (variables, config) = load_body(), load_weights()
+    person = make_evaluation_subject(seeds_of("validation", seed, 1)[0], body, [VIEWS], 256, HeldOut(TARGETS, 0, 0))
+    return variables, config, body, person.inputs(VIEWS), person.held_out
+
+
+def published_case(seed, size):
+    """The same for the published architecture with random weights, on the demo person."""
+    body, capture = load_body(), load_capture("demo_capture")
+    config = presets.published().with_conventions(image_size=size, body_vertices=4000)
+    config = config.with_runtime(dtype="float32", tokens="foreground")
+    variables = init_humangs(jax.random.key(seed), config)
+    return variables, config, body, capture, load_capture("demo_capture/held_out").select(range(TARGETS))
+
+
+def observe(case, name):
+    """{stage: {column: {leaf: array}}} of one training step's forward and backward pass in a number type."""
+    variables, config, body, example = case
+    run = TrainConfig(model=config, loss=LossConfig(random_background=0.0), target_size=config.conventions.image_size)
+    wide = name == "float64"
+    number = np.float64 if wide else np.float32
+    cast = lambda tree: jax.tree.map(lambda x: np.asarray(x, number) if is_real(x) else np.asarray(x), tree)
+    products = {"float64": "highest", "float32": "highest", "tf32": "tensorfloat32"}.get(name, "highest")
+    with jax.enable_x64(wide), jax.default_matmul_precision(products):
+        learned = cast(variables["params"]), cast(variables.get("batch_stats", {}))
+        if name == "float16":
+            model = config.with_runtime(dtype="float16", scan=False)
+            stages = {
+                stage: {"values": values}
+                for stage, values in observer(model, run)(*learned, cast(body), cast(example)).items()
+            }
+        else:
+            run = dataclasses.replace(
+                run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32")
+            )
+            _, found = observe_subject(*learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS)
+            stages = {x.name: {"values": x.values, "cotangents": x.cotangents, "gradients": x.gradients} for x in found}
+        return jax.tree.map(lambda x: np.asarray(x, np.float64), jax.device_get(stages))
+
+
+@functools.cache
+def observer(model, run):
+    """The stages of a forward pass, a compiled function of parameters, batch statistics, body and example."""
+
+    def forward(params, batch_stats, body, example):
+        recorder = Recorder()
+        variables = {"params": params, "batch_stats": batch_stats}
+        with nn.intercept_methods(recorder.watch):
+            prepared = prepare_inputs(body, example.inputs, model)
+            outputs, _ = apply_humangs(variables, prepared, model, True, None, recorder)
+            backgrounds = white_backgrounds(example.targets)
+            draw_targets(outputs, body, example.inputs, example.targets, backgrounds, run, recorder)
+        return recorder.given
+
+    return jax.jit(forward)
+
+
+def is_real(x):
+    """Whether an array holds floating-point numbers."""
+    return jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)

@@ -1,0 +1,228 @@
+"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and verdicts; error by place.
+
+The network is `tiny` with variables of zero; for bodies of other sizes its avatars are made up.
+"""
+
+import json
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from evaluation_cases import capture_from, random_lpips
+
+from experiments import bodies, harness, quality, subjects
+from humangs_jax.losses.perceptual import lpips
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import expected_variables, save_weights
+
+SMALL = ("--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "48")
+
+
+@pytest.fixture
+def weights(tmp_path):
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), expected_variables(tiny()))
+    save_weights(tmp_path / "weights.safetensors", zeros, tiny())
+    return tmp_path / "weights.safetensors"
+
+
+def run(function, *options):
+    assert harness.call(function, [str(option) for option in options]) == 0
+
+
+@pytest.mark.slow
+def test_scores_by_task_are_means_over_views():
+    """With LPIPS of any net; without weights it is missing."""
+    rng, frames = np.random.default_rng(0), np.asarray([0, 0, 1])
+    truth, drawn = rng.random((2, 3, 48, 48, 3)).astype(np.float32)
+    held_out = capture_from(truth, np.ones((3, 48, 48), np.float32), frames)
+    found = subjects.score_tasks(drawn + 0.5, held_out)
+    assert found["novel"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 0), abs=1e-4)
+    assert found["animation"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 1), abs=1e-4)
+    assert found["novel"]["lpips"] is None
+    weights = random_lpips("alex")
+    found = subjects.score_tasks(drawn + 0.5, held_out, weights)["animation"]["lpips"]
+    expected = jax.jit(lpips)(weights, np.clip(drawn[2] + 0.5, 0, 1), truth[2])
+    assert found == pytest.approx(float(expected), rel=1e-5) and found > 0
+
+
+@pytest.mark.parametrize("function", [quality.evaluation_views, bodies.evaluation_bodies])
+def test_wrong_options_are_one_line(function, tmp_path, capsys):
+    (tmp_path / "a.pth").write_bytes(b"something")
+    wrong = {
+        "a.pth": (["--lpips-backbone", tmp_path / "a.pth"], ["--lpips-heads", tmp_path / "a.pth"]),
+        "--views": (["--views", "5"],),
+        "--subjects": (["--subjects", "0"],),
+        "reach beyond": (["--first", "999999"],),
+    }
+    for said, cases in wrong.items():
+        for options in cases:
+            with pytest.raises(SystemExit) as exit_:
+                run(function, *options)
+            assert exit_.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+
+
+def mean_psnr(drawn, truth, chosen):
+    """Mean over the chosen views, by the formula."""
+    errors = (np.clip(drawn, 0, 1) - truth).astype(np.float64)[chosen] ** 2
+    return np.mean(-10 * np.log10(errors.mean(axis=(1, 2, 3))))
+
+
+@pytest.mark.slow
+def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch):
+    """People, reconstruction and drawing are real; every reported number is that of the images that were drawn."""
+    made, drawn, expected = [], [], {}
+    make, draw = quality.make_evaluation_subject, quality.draw_person
+
+    def observed(variables, config, subject, count):
+        drawn.append((subject.seed, count))
+        images, truth = draw(variables, config, subject, count), subject.held_out
+        for task, chosen in (("novel", truth.frames == 0), ("animation", truth.frames != 0)):
+            expected[subject.seed, count, task] = [
+                mean_psnr(x, truth.images, np.asarray(chosen)) for x in (images.ours, images.painted)
+            ]
+        return images
+
+    monkeypatch.setattr(quality, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a))
+    monkeypatch.setattr(quality, "draw_person", observed)
+    out, sheet = tmp_path / "a.json", tmp_path / "sheet.png"
+    options = ("--weights", weights, "--json", out, *SMALL)
+    first, second = 2_000_000, 2_000_001
+    run(quality.evaluation_views, "--subjects", 2, "--views", 1, *options)
+    assert made == [first, second] and drawn == [(first, 1), (second, 1)]
+    numbers = lambda: json.loads(out.read_text())["numbers"]["evaluation_views"]
+    assert numbers()["views"] == 1 and numbers()["by_views"]["1"]["novel"]["lpips"] is None
+
+    made.clear(), drawn.clear()
+    run(quality.evaluation_views, "--subjects", 2, "--views", 2, 1, *options, "--images", sheet)
+    assert made == [first, second] and drawn == [(first, 2), (second, 2)]  # the rows of one photo are kept
+    assert numbers()["views"] == 2 and numbers()["people"] == 2
+    for count in (1, 2):
+        for task in ("novel", "animation"):
+            row = numbers()["by_views"][str(count)][task]
+            ours, painted = np.mean([expected[seed, count, task] for seed in (first, second)], axis=0)
+            assert row["psnr"] == pytest.approx(ours, abs=1e-4)
+            assert row["baseline_psnr"] == pytest.approx(painted, abs=1e-4)
+
+    made.clear(), drawn.clear()
+    sheet.unlink()
+    run(quality.evaluation_views, "--subjects", 1, "--views", 2, *options, "--images", sheet)
+    assert drawn == [(first, 2)] and sheet.is_file()  # for its sheet alone
+
+
+@pytest.mark.slow
+def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_path, monkeypatch):
+    seen, held_out = [], []
+    drawings = {"ours": lambda views: np.clip(views.images + 0.1, 0, 1), "painted": lambda views: 0.5 * views.images}
+
+    def reconstructed(variables, config, capture):
+        assert config.conventions.body_vertices is None and config.conventions.longest_edge is None
+        seen.append((len(capture.body.template), capture.images))
+        return SimpleNamespace(gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3))))
+
+    drawn = lambda avatar, views: held_out.append(views) or SimpleNamespace(images=drawings["ours"](views))
+    for name, fake in {
+        "SMPLX_SEED_VERTICES": 600,
+        "reconstruct": reconstructed,
+        "draw_views": drawn,
+        "painted_body": lambda inputs: None,
+        "draw_painted_body": lambda colors, views: drawings["painted"](views),
+    }.items():
+        monkeypatch.setattr(bodies, name, fake)
+    out, sheet = tmp_path / "a.json", tmp_path / "bodies.png"
+    options = ("--subjects", 1, "--views", 1, "--weights", weights, "--json", out, *SMALL)
+    run(bodies.evaluation_bodies, *options, "--images", sheet)
+    assert [count for count, _ in seen] == [13380, 13380, 1796, 1796, 3345, 3345, 836, 836]  # once to compile
+    assert all(np.array_equal(images, seen[0][1]) for _, images in seen) and sheet.is_file()
+    costs = json.loads(out.read_text())["numbers"]["evaluation_bodies"]["bodies"]
+    assert costs["1/16"]["vertices"] == 836 and costs["1/4"]["costs"]["gaussians"] == 3 * 3345
+    for kind, name in (("default", "ours"), ("painted default body", "painted")):
+        animation = np.asarray(held_out[-1].frames) != 0
+        expected = mean_psnr(drawings[name](held_out[-1]), held_out[-1].images, animation)
+        assert costs[kind]["animation"]["psnr"] == pytest.approx(expected, abs=1e-4)
+    assert bodies.bodies_table(costs).count("\n| ") == len(costs) + 1
+
+
+@pytest.mark.slow  # a person made, reconstructed and drawn
+def test_the_shipped_weights_beat_the_painted_body(tmp_path):
+    options = ("--subjects", 1, "--held-out", 1, "--poses", 1, "--pose-views", 1, "--size", 128, "--views", 4)
+    out, plot = tmp_path / "a.json", tmp_path / "plot.png"
+    run(quality.evaluation_views, *options, "--json", out)
+    tasks = json.loads(out.read_text())["numbers"]["evaluation_views"]["by_views"]["4"]
+    quality.plot_views(plot, {4: tasks})
+    assert plot.is_file() and tasks["novel"]["lpips"] is None and tasks["novel"]["baseline_psnr"] > 10
+    assert all(scores["psnr"] > scores["baseline_psnr"] for scores in tasks.values())
+
+
+# Tables --------------------------------------------------------------------------------------------------------------
+
+
+def people(**psnrs):
+    """Scores by number of photos and seed; seeds count from 1."""
+    base = {"ssim": 0.9, "lpips": None, "baseline_ssim": 0.8, "baseline_psnr_fg": 9.0, "baseline_psnr": 15.0}
+    scores = lambda psnr: base | {"psnr": psnr, "psnr_fg": psnr - 6, "baseline_lpips": None}
+    rows = lambda values: {seed: {"novel": scores(x), "animation": scores(x - 1)} for seed, x in enumerate(values, 1)}
+    return {int(count[1:]): rows(values) for count, values in psnrs.items()}
+
+
+def test_the_best_and_the_worst_are_different_people():
+    extremes = lambda values: quality.extremes(people(v4=values)[4])
+    assert extremes([20 + i for i in range(13)]) == ([13, 12, 11, 10, 9], [1, 2, 3, 4, 5])
+    assert extremes([3, 6, 4]) == ([2], [1]) and extremes([3]) == ([1], [])
+
+
+def test_it_is_told_where_more_photos_are_worse():
+    said = quality.verdict(people(v1=[20], v2=[21], v4=[22]), 4, "novel")
+    assert "never worse" in said and "1 of 1 people" in said
+    said = quality.verdict(people(v1=[20], v2=[19.5], v4=[14]), 4, "animation")
+    assert "by 0.50 dB from 1 to 2" in said and "by 5.50 dB from 2 to 4" in said and "0 of 1 people" in said
+
+
+def test_the_section_has_means_and_the_best_and_worst():
+    section = quality.views_section(people(v1=[21, 22], v4=[25, 26]), 4, "about")
+    assert "| new views, unseen poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
+    assert "LPIPS" not in section and "| worst 1 | 1 | 25.00 |" in section
+
+
+# Where the error is --------------------------------------------------------------------------------------------------
+
+
+def square(size=48, half=12):
+    """A grey square on white: colors, coverage."""
+    alpha = np.zeros((size, size))
+    alpha[size // 2 - half : size // 2 + half, size // 2 - half : size // 2 + half] = 1
+    return np.where(alpha[..., None] > 0, 0.4, 1.0) * np.ones(3), alpha
+
+
+PLACES = ("share at the silhouette", "share in holes", "share in colors", "share around the person")
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_an_error_is_counted_where_it_is(place):
+    image, mask = square()
+    rgb, alpha = image.copy(), mask.copy()
+    if place == "share at the silhouette":
+        rgb, alpha = square(half=11)
+    elif place == "share in holes":
+        rgb[24, 24], alpha[24, 24] = 1, 0
+    elif place == "share in colors":
+        rgb[24, 24] = 0.9
+    else:
+        rgb[2, 2], alpha[2, 2] = 0.4, 1
+    found = quality.error_shares(rgb, alpha, image, mask)
+    assert found["squared error"] > 0 and np.isclose(found[place], found["squared error"])
+    assert all(found[name] == 0 for name in PLACES if name != place)
+    table = quality.error_shares_section({"before": found, "now": found | {place: 0.125}})
+    assert f"| {place} |" in table and "0.125" in table and "squared error" not in table
+
+
+def test_true_coverage_and_semi_transparent_foreground():
+    image, mask = square()
+    rgb, alpha = square(half=11)
+    rgb[24, 24] = 0.5  # so that the PSNR is finite
+    found = quality.error_shares(rgb, alpha, image, mask)
+    assert found["PSNR with the true silhouette and the predicted colors, dB"] > found["PSNR"] + 20
+    alpha = mask.copy()
+    alpha[24:26, 24] = 0.5
+    found = quality.error_shares(image, alpha, image, mask)
+    assert np.isclose(found["semi_transparent"], 2 / mask.sum()) and found["semi_transparent of the true images"] == 0
