@@ -105,3 +105,5 @@ def test_the_list_imports_nothing_heavy_and_the_readme_has_all_names():
     for name, (_, line) in listed().items():
         assert f"{name} " in done.stdout and line, name
         assert f"`{name}" in readme, name
+    for folder, pattern in (("results", "*.json"), ("images", "*.*")):
+        assert [x.name for x in (results.REPOSITORY / "docs" / folder).glob(pattern) if x.name not in readme] == []
