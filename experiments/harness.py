@@ -19,7 +19,7 @@ import re
 import traceback
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -212,7 +212,7 @@ def means(rows: Sequence[Row]) -> Row:
 
 
 @contextlib.contextmanager
-def figure(path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0) -> Iterator[Any]:
+def figure(path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0) -> Generator[Any]:
     """Axes of a row of plots, written when the block ends. legend: share of the height for one legend below all."""
     import matplotlib
 
