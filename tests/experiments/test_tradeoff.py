@@ -2,8 +2,7 @@
 
 import json
 
-from experiments.results import REPOSITORY, blocks_of
-from experiments.splatting import tradeoff as splatting
+from experiments.results import REPOSITORY
 from experiments.tradeoff import report
 from experiments.tradeoff.points import points
 
@@ -56,11 +55,3 @@ def test_the_front_that_ships_is_that_of_the_page():
     result = json.loads((REPOSITORY / "docs/results/tradeoff.json").read_text())["numbers"]
     rows = report.rows_of(result)
     assert json.loads(report.FRONT.read_text()) == report.front_file(rows, result)
-
-
-def test_a_table_of_splatting_settings_is_read_back_as_it_was_written():
-    record = json.loads((REPOSITORY / "docs" / "results" / "splatting_tradeoff.json").read_text())
-    result = splatting.of_table(record["blocks"])
-    assert blocks_of(splatting.table(result)) == record["blocks"]
-    knobs = {row["knob"] for row in result["settings"]}
-    assert knobs >= {"preset", "combined", "hidden", "radius_sigma"} and "extent" not in knobs
