@@ -30,7 +30,7 @@ from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
-from humangs_jax.losses.loss_networks import load_loss_networks
+from humangs_jax.losses.loss_networks import installed_lpips, load_loss_networks
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -62,7 +62,7 @@ class People:
     crop: photos are cut to the person first
     loosest_of: of so many people, those in the loosest clothes
     skinning_reach: metres; other reach of the skinning between the legs than the weights'; 0: by its own vertex alone
-    lpips_backbone: weights of the network under LPIPS, which is missing without them
+    lpips_backbone: weights of the network under LPIPS; those of the extra `lpips` if not given
     lpips_heads: heads of LPIPS, where the backbone's file does not have them
     lpips_net: which network that is
     """
@@ -93,7 +93,8 @@ class People:
             raise ValueError(f"--loosest-of must be at least --subjects, {self.subjects}")
         if self.skinning_reach is not None and self.skinning_reach < 0:
             raise ValueError("--skinning-reach must be at least 0")
-        lpips = load_loss_networks(None, self.lpips_backbone, self.lpips_heads, self.lpips_net).lpips
+        backbone = self.lpips_backbone or installed_lpips().get(self.lpips_net)
+        lpips = load_loss_networks(None, backbone, self.lpips_heads, self.lpips_net).lpips
         body, (variables, config) = load_body(), load_weights(self.weights)
         if (reach := self.skinning_reach) is not None:
             config = config.with_conventions(skinning_reach=reach or None)
@@ -114,7 +115,7 @@ class People:
             "ring": RING,
             "generator": GENERATOR_VERSION,
             "lpips_net": self.lpips_net if lpips else None,
-            "lpips_weights": file_digest(self.lpips_backbone) if lpips and self.lpips_backbone else None,
+            "lpips_weights": file_digest(backbone) if lpips and backbone else None,
         }
         held_out = HeldOut(self.held_out, self.poses, self.pose_views)
         return Start(body, variables, config, seeds, held_out, self.size, lpips, settings)

