@@ -3,10 +3,10 @@
 # captures: photos, cameras, poses
 # photos -> avatar
 from .apps.settings import PRESETS as PRESETS
+from .apps.settings import Budget as Budget
 from .apps.settings import Settings as Settings
 from .apps.settings import reconstruct_with as reconstruct_with
-from .apps.tune import Budget as Budget
-from .apps.tune import tune as tune
+from .apps.settings import tune as tune
 
 # avatar -> poses, videos, files
 from .avatar.animate import animate as animate

@@ -65,7 +65,7 @@ def measure(runs: int, size: int) -> list[dict[str, Any]]:
     """One row a budget: {"reconstruct_ms", "frame_ms"} and {"refused"}, or {"chosen", "tuned", "runs", "within"}."""
     from tqdm import tqdm
 
-    from humangs_jax.apps import tune as tuning
+    from humangs_jax.apps import settings as tuning
     from humangs_jax.data.capture import load_capture
     from humangs_jax.network.weights import load_weights
 

@@ -1,34 +1,49 @@
 """Speed against accuracy in one value: how many photos, how the network runs, how long refinement takes, how frames are drawn.
 
-`PRESETS` are points of the front that experiments/tradeoff/sweep.py has measured (docs/tradeoff.md). `humangs tune` finds
-one for a machine, a person and a budget.
+`PRESETS` are points of the front that experiments/tradeoff/sweep.py has measured (docs/tradeoff.md). `tune` finds one for a
+machine and a person within a budget. The front (assets/front.json) says which settings are worth trying, how good they are, and
+how their times compare. A few are measured, the cheapest first; times of the others are extrapolated from those. What is chosen
+has been measured itself, twice: other programs come and go. Times are without compilation.
 """
 
 import dataclasses
+import itertools
 import json
+import math
 import os
-from typing import Any, Literal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import jax
+import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntable_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import (
     Few,
     Iterations,
     PhotoSide,
     Presets,
+    Range,
     RefineSteps,
     config_from_json,
     config_to_json,
     configuration,
     knob,
 )
+from humangs_jax.core.processes import peak_memory
+from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.usable_views import usable_views
-from humangs_jax.data.view_selection import select_views
+from humangs_jax.data.views import select_views
+from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -153,3 +168,280 @@ def load_settings(path: str | os.PathLike) -> Settings:
             return config_from_json(Settings, json.dumps(content.get("settings")))
         except ValueError as error:
             raise Refused(str(error)) from error
+
+
+# Settings for a budget ------------------------------------------------------------------------------------------------
+
+MARGIN = 1.25
+"""A busy machine is slower later: what is measured times this has to be within the budget."""
+MAKES, FRAMES, STEPS = 3, 16, 6
+"""Repetitions of a measurement, and steps of refinement that are timed. The slowest counts, of frames the 90th percentile."""
+
+
+@configuration
+class FrontPoint:
+    """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
+    without refinement, of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
+    in the pose of the photos and in unseen poses.
+    """
+
+    name: str
+    settings: Settings
+    make: Annotated[float, Range(0, 1e9)]
+    refine: Annotated[float, Range(0, 1e9)]
+    frame: Annotated[float, Range(0, 1e9)]
+    memory_mb: Annotated[float, Range(0, 1e9)]
+    psnr: Annotated[float, Range(-1000, 1000)]
+    psnr_poses: Annotated[float, Range(-1000, 1000)]
+
+    @property
+    def quality(self) -> float:
+        """What points are ranked by, dB."""
+        return 0.5 * (self.psnr + self.psnr_poses)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """Milliseconds of making an avatar and of a frame; MiB that they add to the process at their peak, None: not known."""
+
+    make_ms: float
+    refine_ms: float
+    frame_ms: float
+    memory_mb: float | None = None
+
+    @property
+    def reconstruct_ms(self) -> float:
+        """With refinement."""
+        return self.make_ms + self.refine_ms
+
+    def worst(self, other: "Cost") -> "Cost":
+        """The larger one of each."""
+        memory = (
+            None if None in (self.memory_mb, other.memory_mb) else max(self.memory_mb or 0.0, other.memory_mb or 0.0)
+        )
+        make, refine = max(self.make_ms, other.make_ms), max(self.refine_ms, other.refine_ms)
+        return Cost(make, refine, max(self.frame_ms, other.frame_ms), memory)
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """The most that is allowed; None: anything."""
+
+    reconstruct_ms: float | None = None
+    frame_ms: float | None = None
+    memory_mb: float | None = None
+
+    def allows(self, cost: Cost, margin: float = MARGIN) -> bool:
+        """Whether a cost is within the budget with room to spare (memory needs none: it does not depend on other programs)."""
+        pairs = (
+            (self.reconstruct_ms, margin * cost.reconstruct_ms),
+            (self.frame_ms, margin * cost.frame_ms),
+            (self.memory_mb, cost.memory_mb),
+        )
+        return all(most is None or value is None or value <= most for most, value in pairs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tuned:
+    """What `tune` found. cost: of the point, the worse of two measurements. measured: all costs that were measured, by the name
+    of the point.
+    """
+
+    point: FrontPoint
+    cost: Cost
+    measured: dict[str, Cost]
+
+
+class NoSettingError(ValueError):
+    """No setting is within the budget."""
+
+
+def load_front() -> list[FrontPoint]:
+    """The front that comes with the package, cheapest reconstruction first."""
+    text = resources.files("humangs_jax").joinpath("assets/front.json").read_text()
+    points = [config_from_json(FrontPoint, json.dumps(point)) for point in parse_json(text)["points"]]
+    return sorted(points, key=lambda point: point.make + point.refine)
+
+
+def usable(front: Sequence[FrontPoint], capture: Capture) -> list[FrontPoint]:
+    """The points that a capture can be made with: refinement needs masks."""
+    return [point for point in front if capture.masks is not None or point.settings.refinement is None]
+
+
+def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[str, Cost]) -> Cost:
+    """The cost of a point that was not measured: for each part, that of the measured point nearest to it, times their ratio.
+
+    measured: at least one; by name.
+    """
+    known = [(other, measured[other.name]) for other in front if other.name in measured]
+
+    def part(name: str, value: Callable[[Cost], float]) -> float:
+        wanted = getattr(point, name)
+        pairs = [(getattr(other, name), value(cost)) for other, cost in known if getattr(other, name) > 0]
+        if wanted == 0 or not pairs:
+            return 0.0  # refinement that nothing measured has: tried, and then measured
+        ratio, found = min(pairs, key=lambda pair: abs(math.log(pair[0] / wanted)))
+        return found * wanted / ratio
+
+    memory = (
+        None if any(cost.memory_mb is None for _, cost in known) else part("memory_mb", lambda c: c.memory_mb or 0.0)
+    )
+    return Cost(
+        part("make", lambda c: c.make_ms),
+        part("refine", lambda c: c.refine_ms),
+        part("frame", lambda c: c.frame_ms),
+        memory,
+    )
+
+
+def choose(front: Sequence[FrontPoint], measured: Mapping[str, Cost], budget: Budget) -> FrontPoint | None:
+    """The point to go on with: the best whose cost, measured or predicted, the budget allows. It is the answer if it has been
+    measured, and is to be measured next if not. None: no point is within the budget. Pure.
+    """
+    if not measured:
+        return min(front, key=lambda point: (point.make + point.refine, point.frame))
+    cost = lambda point: measured.get(point.name) or predict(point, front, measured)
+    allowed = [point for point in front if budget.allows(cost(point))]
+    return max(allowed, key=lambda point: point.quality, default=None)
+
+
+def tune(
+    variables: Variables,
+    config: HumanGSConfig,
+    capture: Capture,
+    budget: Budget,
+    size: int = 512,
+    front: Sequence[FrontPoint] | None = None,
+    progress: bool = False,
+) -> Tuned:
+    """The best settings of the front within a budget, for a capture and frames of `size` pixels.
+
+    Arguments: front: points to choose from; None: `load_front`. Those that ask for more photos than the capture has are
+    tried with all it has. progress: show a bar.
+
+    Raises: NoSettingError if none is, saying what the cheapest takes; ValueError if memory is limited where it cannot be
+    measured.
+    """
+    front = usable(load_front() if front is None else front, capture)
+    measured: dict[str, Cost] = {}
+    confirmed = set()
+    with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:
+        while (point := choose(front, measured, budget)) is not None:
+            if point.name in confirmed:
+                return Tuned(point, measured[point.name], measured)
+            shown.set_postfix_str(point.name)
+            cost = measure(point.settings, variables, config, capture, size)
+            if point.name in measured:
+                cost = cost.worst(measured[point.name])
+                confirmed.add(point.name)
+            measured[point.name] = cost
+            if budget.memory_mb is not None and measured[point.name].memory_mb is None:
+                raise ValueError("memory_mb: how much memory is used cannot be measured on this system")
+            shown.update()
+    least = {name: min(getattr(cost, name) for cost in measured.values()) for name in ("reconstruct_ms", "frame_ms")}
+    memory = [cost.memory_mb for cost in measured.values() if cost.memory_mb is not None]
+    needs = f"{least['reconstruct_ms']:.0f} ms a reconstruction, {least['frame_ms']:.1f} ms a frame of {size} pixels"
+    needs += f", {min(memory):.0f} MiB" if memory else ""
+    raise NoSettingError(
+        f"no setting is within the budget: the least that was measured is {needs}, and {MARGIN - 1:.0%} of room is kept "
+        "for a busy machine; smaller frames are faster"
+    )
+
+
+def measure(settings: Settings, variables: Variables, config: HumanGSConfig, capture: Capture, size: int = 512) -> Cost:
+    """What settings cost here: an avatar of this capture, and frames of it from all around.
+
+    Compiling and choosing photos, which happen once for a set of cameras, do not count.
+    """
+    photos = settings.photos(capture)
+    make = lambda: reconstruct_with(settings.unrefined, variables, config, photos)
+    avatar = make()  # compiles
+    make_ms = max(_milliseconds(make) for _ in range(MAKES))
+    refine = lambda how: _uninterrupted(refine_with_report(avatar, photos, how)).seconds
+    refine_ms, parts = 0.0, refinement_parts(settings)
+    for how, times in parts:
+        refine_ms += 1e3 * times * max(refine(how) for _ in range(2))
+    frames = frames_of(avatar, settings, size)
+    next(frames)
+    frame_ms = float(np.quantile([_milliseconds(lambda: next(frames)) for _ in range(FRAMES)], 0.9))
+    with peak_memory() as peak:
+        make()
+        for how, _ in parts:
+            refine(how)
+        next(frames)
+    on_host = jax.default_backend() == "cpu"  # what the process takes is known, what a device takes is not
+    return Cost(make_ms, refine_ms, frame_ms, peak[0] if on_host else None)
+
+
+def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
+    """Short runs of refinement, and how often each has to be counted: the iterations, and a few steps for all."""
+    few = min(settings.refine_steps, STEPS)
+    iterations = dataclasses.replace(settings, refine_steps=0).refinement
+    steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few).refinement
+    if steps is not None:
+        steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
+    return [
+        (c, times) for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None
+    ]
+
+
+def frames_of(avatar: Avatar, settings: Settings, size: int):
+    """Renderings without end, around the avatar in its T-pose. Nothing is pruned: that is of a motion and its cameras."""
+    shot = settings.shot(Shot(size=size))
+    poses, cameras = turntable_views(avatar, rest_pose_of(avatar), 8, shot)
+    turns = [itertools.cycle(range(8)) for _ in range(2)]
+    pose = lambda i: jax.tree.map(lambda x: x[i], poses)
+    drawn = draw(avatar, map(pose, turns[0]), (cameras[i] for i in turns[1]), how=splatting_of(shot, avatar))
+    return (jax.block_until_ready(rendering) for rendering in drawn)
+
+
+def _uninterrupted(run):
+    if run.interrupted:
+        raise KeyboardInterrupt
+    return run
+
+
+def _milliseconds(run):
+    began = time.perf_counter()
+    run()
+    return 1e3 * (time.perf_counter() - began)
+
+
+def in_words(tuned: Tuned, best: FrontPoint) -> str:
+    """What was chosen, what it takes, and what it gives up against the best setting, by the committed sweep."""
+    settings, cost, point = tuned.point.settings, tuned.cost, tuned.point
+    views, size = settings.views, settings.runtime.image_size
+    parts = ["all photos" if views is None else f"{views} photo{'s' * (views > 1)}"]
+    parts += [f"of {size} pixels"] if size else []
+    parts += ["cut to the person"] if settings.runtime.crop else []
+    refined = [
+        f"{n} {name}" for n, name in ((settings.refine_iterations, "iterations"), (settings.refine_steps, "steps")) if n
+    ]
+    parts += [f"{' and '.join(refined)} of refinement" if refined else "no refinement"]
+    parts += [f"drawn {settings.splat}"]
+    takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
+    takes += "" if cost.memory_mb is None else f", {cost.memory_mb:.0f} MiB"
+    lost = best.psnr - point.psnr, best.psnr_poses - point.psnr_poses
+    gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in unseen poses against {best.name!r}"
+    gives = "is the best of all settings" if point.name == best.name else gives
+    return f"{point.name}: {', '.join(parts)}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
+
+
+def both_avatars(
+    variables: Variables, config: HumanGSConfig, capture: Capture, chosen: FrontPoint, best: FrontPoint, size: int
+) -> Float[np.ndarray, "h w 3"]:
+    """The person of a capture as two settings make and draw it: left the chosen one, right the best."""
+    images = []
+    for point in (chosen, best):
+        avatar = reconstruct_with(point.settings, variables, config, capture, progress=True)
+        rgb = np.asarray(next(frames_of(avatar, point.settings, size)).rgb)
+        images.append(np.clip(rgb, 0, 1))
+    return np.concatenate(images, axis=1)
+
+
+def write_tuned(out: Path, image: Float[np.ndarray, "h w 3"], tuned: Tuned, budget: Budget, size: int) -> None:
+    """The settings, and beside them the image: `out` with the suffix .png. Raises: OSError."""
+    write_png(out.with_suffix(".png"), image)
+    measured = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
+    about = {"name": tuned.point.name, "budget": dataclasses.asdict(budget), "frame_size": size, "measured": measured}
+    save_settings(out, tuned.point.settings, **about)

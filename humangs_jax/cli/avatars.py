@@ -108,7 +108,7 @@ class Reconstruct:
         require_avatar(self.out)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct
-            from humangs_jax.data.view_selection import select_views
+            from humangs_jax.data.views import select_views
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -377,7 +377,7 @@ class Tune:
         for path in (self.out, self.out.with_suffix(".png")):
             require_parent(path, inputs=(self.weights,))
         with stage("starting"):
-            from humangs_jax.apps.tune import Budget, both_avatars, in_words, load_front, tune, usable, write_tuned
+            from humangs_jax.apps.settings import Budget, both_avatars, in_words, load_front, tune, usable, write_tuned
             from humangs_jax.network.weights import load_weights
 
         photos = _read_capture(self.capture, check=False)

@@ -57,24 +57,26 @@ OPTIONAL_BODY_KEYS = {"shape_names"}
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Capture:
-    """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one.
-
-    images: (v, h, w, 3) in [0, 1], white behind the masks. masks: (v, h, w) coverage in [0, 1], or None.
-    cameras: a batch of v, metres. frames: (v,) the frame that each view shows, an index into `poses`.
-    body: the model that the parameters belong to. betas: (s,) its shape, fewer than it has are allowed.
-    poses: a batch of m. names: one per view, used as file names.
-    body_file: where the model comes from, "makehuman" or a path.
-    """
+    """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one."""
 
     images: Float[np.ndarray, "v h w 3"]
+    """In [0, 1], white behind the masks."""
     masks: Float[np.ndarray, "v h w"] | None
+    """Coverage in [0, 1]."""
     cameras: Camera
+    """A batch of v, metres."""
     frames: Int[np.ndarray, " v"]
+    """The frame that each view shows, an index into `poses`."""
     body: BodyModel
+    """The model that the parameters belong to."""
     betas: Float[np.ndarray, " s"]
+    """Its shape; fewer than it has are allowed."""
     poses: BodyPose
+    """A batch of m."""
     names: tuple[str, ...]
+    """One per view, used as file names."""
     body_file: str = DEFAULT_BODY
+    """Where the model comes from, "makehuman" or a path."""
 
     __repr__ = short_repr
 

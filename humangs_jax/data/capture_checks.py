@@ -132,9 +132,7 @@ def checked_camera(
 
 def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
     """An integer that counts one of the poses."""
-    if isinstance(frame, bool) or not isinstance(frame, int):
-        raise CaptureError(file, field, f"expected an integer, got {shown(frame)}")
-    if not 0 <= frame < count:
+    if not 0 <= expect(frame, int, file, field) < count:
         raise CaptureError(file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}")
     return frame
 

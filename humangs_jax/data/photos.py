@@ -17,9 +17,17 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
-from humangs_jax.data.masks import masks_at_edges
-from humangs_jax.data.rims import clean_rims
+from humangs_jax.data.capture_checks import (
+    CaptureError,
+    checked_camera,
+    checked_frame,
+    checked_json,
+    expect,
+    few,
+    members,
+    numbers,
+)
+from humangs_jax.data.masks import clean_rims, masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, orientation, read_grey, read_image
 from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown, write_json
@@ -42,17 +50,18 @@ second; with fewer pixels than the third share they are the rim of someone outsi
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Photos:
-    """Photos of one person (numpy on the host).
-
-    images: (v, h, w, 3) in [0, 1], white behind the masks. masks: (v, h, w) coverage in [0, 1], or None.
-    cameras: a batch of v, metres. frames: (v,) the frame that each view shows. names: one per view.
-    """
+    """Photos of one person (numpy on the host)."""
 
     images: Float[np.ndarray, "v h w 3"]
+    """In [0, 1], white behind the masks."""
     masks: Float[np.ndarray, "v h w"] | None
+    """Coverage in [0, 1]."""
     cameras: Camera
+    """A batch of v, metres."""
     frames: Int[np.ndarray, " v"]
+    """The frame that each view shows."""
     names: tuple[str, ...]
+    """One per view."""
 
     @property
     def frame_count(self) -> int:
@@ -84,30 +93,22 @@ def capture_folder(path: str | Path) -> Path:
 def read_description(file: Path) -> dict[str, Any]:
     """capture.json with all keys and types checked, except the matrices. Its paths stay in the folder."""
     description = checked_json(file, missing="no such file: a capture is a folder with a capture.json")
-    if not isinstance(description, dict):
-        raise CaptureError(file, "", f"expected a JSON object, got {type(description).__name__}")
-    if description.get("format") != FORMAT:
-        raise CaptureError(file, "format", f"expected {FORMAT!r}, got {shown(description.get('format'))}")
-    if description.get("version") != VERSION:
-        raise CaptureError(file, "version", f"expected {VERSION}, got {shown(description.get('version'))}")
+    for key, wanted in (("format", FORMAT), ("version", VERSION)):
+        if (found := expect(description, dict, file, "").get(key)) != wanted:
+            raise CaptureError(file, key, f"expected {wanted!r}, got {shown(found)}")
     check_keys(description, TOP_KEYS, TOP_KEYS - {"background"}, file)
-    body = description["body"]
-    if not isinstance(body, str) or Path(body).suffix != ".npz":  # fits write it: it must not be a photo
+    body, views = members(description, file, body=str, views=list)
+    if Path(body).suffix != ".npz":  # fits write it: it must not be a photo
         raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
     check_inside(file, "body", body)
     check_background(description.get("background", "photo"), file)
-    views = description["views"]
-    if not isinstance(views, list) or not views:
+    if not views:
         raise CaptureError(file, "views", "expected a list of at least one view")
     for i, view in enumerate(views):
-        if not isinstance(view, dict):
-            raise CaptureError(file, f"views[{i}]", f"expected a JSON object, got {shown(view)}")
-        check_keys(view, VIEW_KEYS, VIEW_KEYS - {"mask", "frame"}, file, f"views[{i}].")
-        for key in ("image", "mask"):
-            if key in view and not (isinstance(view[key], str) and view[key]):
-                raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {shown(view[key])}")
-            if key in view:
-                check_inside(file, f"views[{i}].{key}", view[key], photo=True)
+        field = f"views[{i}]"
+        check_keys(expect(view, dict, file, field), VIEW_KEYS, VIEW_KEYS - {"mask", "frame"}, file, f"{field}.")
+        for key in VIEW_KEYS & {"image", "mask"} & view.keys():
+            check_inside(file, f"{field}.{key}", expect(view[key], str, file, f"{field}.{key}"), photo=True)
     return description
 
 
@@ -180,10 +181,10 @@ def read_photos(
     """
     file, views = folder / "capture.json", description["views"]
     if poses is None:
-        frames = [view.get("frame", 0) for view in views]
-        for i, frame in enumerate(frames):
-            if isinstance(frame, bool) or not isinstance(frame, int) or frame < 0:
-                raise CaptureError(file, f"views[{i}].frame", f"expected an integer of at least 0, got {shown(frame)}")
+        frames = [expect(view.get("frame", 0), int, file, f"views[{i}].frame") for i, view in enumerate(views)]
+        if min(frames) < 0:
+            field = f"views[{frames.index(min(frames))}].frame"
+            raise CaptureError(file, field, f"expected an integer of at least 0, got {shown(min(frames))}")
         poses = 1 + max(frames)
         with reading(file, "capture", CaptureError):
             check_limit("frames", poses, "frames")
@@ -203,7 +204,9 @@ def read_photos(
     return Photos(images, masks, stack_cameras(cameras), frames, names)
 
 
-def _check_orientations(folder, views, K, width, height, warns):
+def _check_orientations(
+    folder: Path, views: Sequence[dict[str, Any]], K: Float[np.ndarray, "v 3 3"], width: int, height: int, warns: bool
+) -> None:
     """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of the turned photo."""
     flagged = []
     for view, camera in zip(views, K, strict=True):
@@ -217,9 +220,8 @@ def _check_orientations(folder, views, K, width, height, warns):
             )
             raise CaptureError(file, "orientation", problem)
     if flagged and warns:
-        names = flagged[0] + (f" and {len(flagged) - 1} more" if len(flagged) > 1 else "")
         told = "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras` turns such photos)"
-        logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, names, told)
+        logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, few(flagged, 1), told)
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
@@ -250,7 +252,9 @@ def check_repeats(file: Path, photos: Sequence[Path]) -> None:
         check_limit("views_per_photo", each, f"views of each photo ({len(photos):,} of {len(found):,})")
 
 
-def _read_images(folder, views, on_white, fit_masks):
+def _read_images(
+    folder: Path, views: Sequence[dict[str, Any]], on_white: bool, fit_masks: bool
+) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
     """Images and masks (or None), all of one size."""
     images, masks, searched = None, None, []
     for i, view in enumerate(views):

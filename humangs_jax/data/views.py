@@ -1,4 +1,4 @@
-"""Photos of one subject with the body parameters of each, and the inputs that the network computes from them."""
+"""Photos of one subject with the body parameters of each, inputs that the network computes from them, and which photos to use."""
 
 import dataclasses
 import functools
@@ -11,19 +11,21 @@ import numpy as np
 
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
-from humangs_jax.body.subdivision import split_long_edges
+from humangs_jax.body.subdivision import split_long_edges, vertex_areas
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.motion.rules import nearest_axis, standing_axis, turned_upright, upright_matrix
-from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
+from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_indices, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
+from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.pixel_aligned import project_vertices, visible_vertices
 from humangs_jax.network.surface_map import surface_texels
 from humangs_jax.rendering.mesh.position_map import (
     BACKGROUND,
@@ -282,3 +284,84 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
     )
+
+
+# Which photos of many -------------------------------------------------------------------------------------------------
+
+SELECTION_SIZE = 128
+"""Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
+SELECTION_VERTICES = 2000
+"""Of the body that is looked at."""
+LEAST_GAIN = 0.03
+"""A further photo has to add this share to what the chosen ones show. Only where no number of photos is given."""
+
+
+@checked_arguments
+def select_views(capture: Capture, count: int | None) -> list[int]:
+    """The numbers of `count` photos, in ascending order, that together show the body best; all of them if there are no more.
+
+    count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
+
+    Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
+    is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
+    https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count; photos whose mask does not show
+    the person are never chosen (`usable_indices`).
+
+    Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
+    """
+    if count is not None and count < 1:
+        raise ValueError(f"select_views: expected at least 1 photo, got {count}")
+    usable = usable_indices(capture)
+    if count is not None and len(usable) <= count:
+        return usable
+    capture = capture.select(usable)
+    body = (
+        decimate(capture.body, SELECTION_VERTICES) if len(capture.body.template) > SELECTION_VERTICES else capture.body
+    )
+    quality = np.asarray(_quality(body, standardize(capture, SELECTION_SIZE)))
+    area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
+    least = LEAST_GAIN if count is None else 0.0
+    chosen = greedy_cover(quality * area, capture.view_count if count is None else count, least)
+    return sorted(usable[i] for i in chosen)
+
+
+def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
+    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most; none after the first that
+    raises it by less than the share `least`.
+    """
+    chosen: list[int] = []
+    best = np.zeros(quality.shape[1])
+    for _ in range(min(count, len(quality))):
+        sums = np.maximum(quality, best).sum(axis=1)
+        sums[chosen] = -np.inf
+        if chosen and sums.max() < (1 + least) * best.sum():
+            break
+        chosen.append(int(np.argmax(sums)))
+        best = np.maximum(best, quality[chosen[-1]])
+    return chosen
+
+
+def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
+    """How well every view shows every vertex, in [0, 1].
+
+    The cosine between normal and line of sight, times pixels per metre over the most of all views; 0 where the
+    vertex is hidden or outside of the mask.
+    """
+    config = presets.small().with_conventions(pixels="person")
+    inputs = prepare_inputs(body, views, config)
+    unit = subject_unit(inputs.canonical_vertices)
+    assert inputs.posed_normals is not None  # `prepare_inputs` computes them
+
+    def quality(camera, vertices, normals, depth_map):
+        pixels, depths = project_vertices(camera, vertices)
+        seen = visible_vertices(pixels, depths, depth_map, (camera.width, camera.height), "half_pixel")
+        towards = camera.center - vertices
+        facing = jnp.sum(towards * normals, -1) / jnp.maximum(jnp.linalg.norm(towards, axis=-1), 1e-6)
+        return jnp.where(seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0)
+
+    cameras = views.cameras.in_units(unit)
+    shown = jax.vmap(quality)(cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps)
+    return shown / jnp.maximum(jnp.max(shown), 1e-6)
+
+
+_quality = jax.jit(view_quality)

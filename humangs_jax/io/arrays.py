@@ -47,6 +47,7 @@ def numbers(
             raise TypeError
         array = array.astype(dtype)
     except (ValueError, TypeError, OverflowError):
+        words = f"real numbers, got {value.dtype}" if isinstance(value, np.ndarray) else words
         raise error(file, field, f"expected {words}") from None
     if some and not array.size:
         raise error(file, field, f"expected at least one number, got shape {array.shape}")

@@ -10,9 +10,22 @@ from command_line import run
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from humangs_jax.apps import tune as tuning
-from humangs_jax.apps.settings import PRESETS, Settings, load_settings, save_settings
-from humangs_jax.apps.tune import MARGIN, Budget, Cost, FrontPoint, choose, in_words, load_front, predict, tune
+from humangs_jax.apps import settings as tuning
+from humangs_jax.apps.settings import (
+    MARGIN,
+    PRESETS,
+    Budget,
+    Cost,
+    FrontPoint,
+    Settings,
+    choose,
+    in_words,
+    load_front,
+    load_settings,
+    predict,
+    save_settings,
+    tune,
+)
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import Preset

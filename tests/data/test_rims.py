@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from humangs_jax.data.rims import CERTAIN, DEPTH, PERSON_HEIGHT, clean_rims
+from humangs_jax.data.masks import CERTAIN, DEPTH, PERSON_HEIGHT, clean_rims
 
 SKIN, ROOM = np.asarray([0.8, 0.5, 0.4], np.float32), np.asarray([0.1, 0.2, 0.9], np.float32)
 ROUNDING = 1e-5

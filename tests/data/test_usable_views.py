@@ -12,8 +12,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.usable_views import shares_on_masks, usable_indices, usable_views
-from humangs_jax.data.view_selection import select_views
-from humangs_jax.data.views import standardize
+from humangs_jax.data.views import select_views, standardize
 from humangs_jax.refinement.crops import crop_to_person
 
 

@@ -3,15 +3,20 @@
 import dataclasses
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.subdivision import vertex_areas
+from humangs_jax.core.pytree import replace
+from humangs_jax.data import views as module
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.data.view_selection import greedy_cover, select_views
+from humangs_jax.data.views import greedy_cover, select_views, standardize
 
 GUARANTEE = 1 - 1 / np.e
 """Of the greedy choice for a monotone submodular function."""
@@ -70,3 +75,32 @@ def test_the_choice_ends_where_the_gain_does(quality, least):
     assert all(later >= (1 + least) * earlier for earlier, later in itertools.pairwise(sums))
     rest = [covered(quality, [*chosen, row]) for row in range(6) if row not in chosen]
     assert all(more < (1 + least) * sums[-1] for more in rest)
+
+
+def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
+    doubled, away = demo.select([0, 0, 2, 2]), 1.5
+    matrices = np.array(doubled.cameras.cam_from_world)
+    matrices[::2, 2, 3] += away
+    capture = dataclasses.replace(doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices)))
+    body = decimate(capture.body, module.SELECTION_VERTICES)
+    quality = np.asarray(module._quality(body, standardize(capture, module.SELECTION_SIZE)))
+    for far, near in ((0, 1), (2, 3)):
+        both = (quality[far] > 0) & (quality[near] > 0)
+        distance = matrices[near, 2, 3]
+        # the rays of the nearer camera spread more, by some degrees
+        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(
+            distance / (distance + away), rel=0.1
+        )
+
+
+def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
+    """One photo shows the 60 % of the vertices with the smallest areas, the other one the others: more skin."""
+
+    def quality(body, views):
+        area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
+        small = area <= np.quantile(area, 0.6)
+        assert area[small].sum() < area[~small].sum()
+        return np.stack([small, ~small]).astype(float)
+
+    monkeypatch.setattr(module, "_quality", quality)
+    assert select_views(demo.select([0, 1]), 1) == [1]

@@ -29,7 +29,7 @@ HERE = Path(__file__).resolve().parent
 SECONDS = 300
 """Longest that a run may take on a busy machine."""
 HEAVY = (
-    *("apps.check", "apps.demo", "apps.tune", "avatar.frames", "avatar.layers", "avatar.video"),
+    *("apps.check", "apps.demo", "apps.settings", "avatar.frames", "avatar.layers", "avatar.video"),
     *("data.calibration.importing", "people.writer", "refinement.refine", "training.diagnose", "viewer.page"),
     *("fitting.examination", "fitting.fit_capture", "fitting.refine", "fitting.scan_views", "network.conversion"),
 )
@@ -355,7 +355,7 @@ def stand_ins(variant):
         return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
 
     def tuned(*_, **__):
-        from humangs_jax.apps.tune import Cost, Tuned, load_front
+        from humangs_jax.apps.settings import Cost, Tuned, load_front
 
         return Tuned(load_front()[variant], Cost(variant, 0.0, 1.0), {})
 
@@ -392,8 +392,8 @@ def stand_ins(variant):
         ("apps.demo", "painted_body", lambda _: None),
         ("apps.demo", "draw_painted_body", lambda *_: None),
         ("apps.demo", "motion_frames", frames),
-        ("apps.tune", "tune", tuned),
-        ("apps.tune", "both_avatars", lambda *_: random_of(variant, 4).random((16, 32, 3))),
+        ("apps.settings", "tune", tuned),
+        ("apps.settings", "both_avatars", lambda *_: random_of(variant, 4).random((16, 32, 3))),
         ("evaluation.run", "score_views", scored),
         ("fitting.fit_capture", "fit_photos", fitted),
         ("fitting.refine", "refine_capture", refined),
