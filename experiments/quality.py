@@ -35,8 +35,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.data.loader import ViewSampling, find_captures
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
-from humangs_jax.data.view_selection import select_views
-from humangs_jax.data.views import gaussian_body
+from humangs_jax.data.views import gaussian_body, select_views
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.losses import metrics
