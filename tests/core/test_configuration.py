@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import experiments.systems  # noqa: F401
-from humangs_jax.apps import settings, tune
+from humangs_jax.apps import settings
 from humangs_jax.core.configuration import _PARTS, Range, _ranges, config_from_json, config_to_json, configuration, vary
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.people.on_the_fly import OnTheFlyConfig
@@ -31,7 +31,7 @@ def reachable(cls, found):
 ALL = set()
 for each in (
     settings.Settings,
-    tune.FrontPoint,
+    settings.FrontPoint,
     config.TrainConfig,
     settings.RefineConfig,
     OnTheFlyConfig,
