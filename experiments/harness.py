@@ -184,7 +184,7 @@ class Run:
         if old != settings:
             print(f"{self.json}: made with other settings, so it is replaced")
             return {}
-        return rows
+        return {name: row for name, row in rows.items() if not (isinstance(row, dict) and "failed" in row)}
 
     def _write(self):
         if self.json:

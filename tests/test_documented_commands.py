@@ -48,7 +48,7 @@ SLOW = (
     "evaluate me --avatar avatar.npz --protocol lhm",
 )
 """And on the demo's photos, in this order: the first ones make what the others read."""
-HEAVY = ("tests/", "experiments/training/train_shipped.py")
+HEAVY = ("tests/", "experiments.train_shipped.py")
 MORE = (
     [],
     ["1"],

@@ -319,7 +319,7 @@ class Bench:
 
     def published(self, point) -> dict[str, Any]:
         """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
-        from experiments.reconstruction.cases import random_variables
+        from experiments.reconstruction import random_variables
         from humangs_jax.apps.settings import reconstruct_with
         from humangs_jax.core.processes import peak_memory
         from humangs_jax.network.presets import published

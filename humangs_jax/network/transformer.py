@@ -14,7 +14,7 @@ stand at the end; the first `count` ones are attended to. Three exact implementa
 
 "auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens (not in float64: its
 softmax is always float32), and "chunked" otherwise. On a CPU of two cores, 4,097 tokens and 12 heads of 64, "xla" needs
-2.6 s of processor time and 7.9 with its gradient, "chunked" 0.8 and 2.9 (experiments/reconstruction/attention.py).
+2.6 s of processor time and 7.9 with its gradient, "chunked" 0.8 and 2.9 (measured when it was written).
 """
 
 from typing import Any, cast

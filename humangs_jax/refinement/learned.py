@@ -7,7 +7,7 @@ a frozen network, and the neighbours are those in the T-pose, at two levels: of 
 photos, the nearest silhouette that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them
 on.
 
-Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. Parts that no photo shows move with
+Trained (`python -m experiments train_refiner`) on views that are not among the photos. Parts that no photo shows move with
 their neighbours. Gradient descent on the photos cannot do that.
 """
 

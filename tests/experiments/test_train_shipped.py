@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tyro
 
-from experiments.training import train_shipped
+from experiments import train_shipped
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import load_weights, save_weights

@@ -11,7 +11,7 @@ import pytest
 from loss_cases import convolutions_of, image_pair, made_up_heads
 from rounding import bound
 
-from experiments.training.cases import random_weights
+from experiments.training import random_weights
 from humangs_jax.losses import perceptual
 from humangs_jax.losses.perceptual import (
     BACKBONES,

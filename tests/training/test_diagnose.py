@@ -13,7 +13,7 @@ from rounding import bound
 from target_cases import DRIVEN, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import without_upsampler
 
-from experiments.training.cases import random_weights
+from experiments.training import random_weights
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
 from humangs_jax.losses.loss_networks import LossNetworks

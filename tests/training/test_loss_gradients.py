@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from experiments.training.loss_gradients import NETWORKS, agreement, network_case, own_case, term_names
+from experiments.training_checks import NETWORKS, agreement, network_case, own_case, term_names
 
 OWN = 1e-7
 """Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners have some within a step."""

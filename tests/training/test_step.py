@@ -10,7 +10,7 @@ import pytest
 from rounding import bound
 from training_cases import without_upsampler
 
-from experiments.training.cases import random_weights
+from experiments.training import random_weights
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import reconstruct_views
 from humangs_jax.body.model import BodyPose

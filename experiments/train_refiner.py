@@ -1,25 +1,61 @@
-"""Train the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the shipped network.
-
-    python experiments/training/train_refiner.py --out runs/refiner
-    python experiments/training/train_refiner.py --out runs/more --start runs/refiner/refiner.safetensors
+"""Trains the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the shipped network.
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
-ten views, four of them those photos. A step draws --batch samples and a number of photos for each, runs the iterations, and
-compares the result of each round with views that are not among the photos. Gradients pass through the iterations, but not
-through the errors that a round sees.
-The same command continues the run in --out; Ctrl-C saves. Writes OUT/refiner.safetensors. Validation is on other people.
-
-On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three iterations.
+ten views, four of them those photos. A step draws samples and a number of photos for each, runs the iterations, and compares the
+result of each round with views that are not among the photos. Gradients pass through the iterations, but not through the errors
+that a round sees. Validation is on other people.
 """
 
-import argparse
 import dataclasses
 import functools
-import sys
+import inspect
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import serialization
+from tqdm import tqdm
+
+from experiments.harness import Run, entry
+from experiments.results import write_json
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.low_pass import without_low_pass
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.compiling import compiler_options
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.images import to_uint8
+from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import read_json
+from humangs_jax.losses.ssim import structural_dissimilarity
+from humangs_jax.network.weights import load_weights
+from humangs_jax.people.bank import build_bank, load_bank, save_bank
+from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
+from humangs_jax.people.seeds import seeds_of
+from humangs_jax.refinement.learned import (
+    Refiner,
+    Signals,
+    graph_of,
+    photo_signals,
+    read_refiner,
+    refiner_round,
+    save_refiner,
+    stacked,
+    unstacked,
+)
+from humangs_jax.refinement.objective import Photos, posed_gaussians
+from humangs_jax.refinement.parameters import parameters_of
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+from humangs_jax.rendering.splatting import plan_buffers, render
 
 FIRST_SEED = 6000
 """Of the training range, after those of the shipped network."""
@@ -34,48 +70,44 @@ MARGIN = 2.0
 """Room in the renderer's buffers beyond the need of the starts."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the samples, the state and the weights")
-    parser.add_argument("--people", type=int, default=400, help="people of the samples")
-    parser.add_argument("--samples", type=int, default=600, help="to train on")
-    parser.add_argument(
-        "--start",
-        type=Path,
-        help="weights to start from, of all layers or some; default: a network that changes nothing",
-    )
-    parser.add_argument("--steps", type=int, default=1300)
-    parser.add_argument("--iterations", type=int, default=3)
-    parser.add_argument("--batch", type=int, default=2, help="samples in a step, a thread each")
-    parser.add_argument("--learning-rate", type=float, default=1.5e-3)
-    arguments = parser.parse_args()
+@dataclasses.dataclass(frozen=True)
+class Refining:
+    """Options:
+    people: of the samples
+    samples: to train on
+    start: weights to start from, of all layers or some; default: a network that changes nothing
+    batch: samples in a step, a thread each
+    """
+
+    people: int = 400
+    samples: int = 600
+    start: Path | None = None
+    steps: int = 1300
+    iterations: int = 3
+    batch: int = 2
+    learning_rate: float = 1.5e-3
+
+
+@entry
+def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
+    """Trains the learned update of refinement; the same command continues the run, Ctrl-C saves.
+
+    On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three iterations.
+
+    Options:
+    out: folder of the samples, the state and the weights (refiner.safetensors)
+    """
     counts = ("samples", "people", "steps", "iterations", "batch")
-    if min(getattr(arguments, name) for name in counts) < 1:
-        parser.error(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
-    from humangs_jax.core.processes import keep_freed_memory
-
-    keep_freed_memory()
-    try:
-        keep_settings(arguments)
-        folders = make_samples(arguments.out / "samples", FIRST_SEED, arguments.people, arguments.samples)
-        validation = make_samples(arguments.out / "validation", FIRST_SEED + arguments.people, VALIDATED, VALIDATED)
-        train(folders, validation, arguments)
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
-
-
-def keep_settings(arguments: argparse.Namespace) -> None:
-    """Write OUT/settings.json, or raise ValueError if the run there has others."""
-    from humangs_jax.io.reading import read_json, write_json
-
-    path = arguments.out / "settings.json"
-    settings = {name: str(x) if isinstance(x, Path) else x for name, x in vars(arguments).items() if name != "out"}
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    if min(getattr(options, name) for name in counts) < 1:
+        raise ValueError(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
+    path, settings = out / "settings.json", json.loads(json.dumps(dataclasses.asdict(options), default=str))
     if not path.is_file():
         write_json(path, settings)
     elif (known := read_json(path)) != settings:
-        raise ValueError(f"{path}: this run has other settings, {known}: give another --out")
+        raise ValueError(f"{path}: this run has other settings, {known}: give another folder")
+    folders = make_samples(out / "samples", FIRST_SEED, options.people, options.samples)
+    validation = make_samples(out / "validation", FIRST_SEED + options.people, VALIDATED, VALIDATED)
+    train(folders, validation, out, options)
 
 
 # Samples ------------------------------------------------------------------------------------------------------------------
@@ -83,25 +115,6 @@ def keep_settings(arguments: argparse.Namespace) -> None:
 
 def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
     """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are there are kept."""
-    import os
-
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-    from tqdm import tqdm
-
-    from humangs_jax.avatar.low_pass import without_low_pass
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.body.library import load_body
-    from humangs_jax.body.model import BodyPose
-    from humangs_jax.data.capture import Capture
-    from humangs_jax.io.images import to_uint8
-    from humangs_jax.io.npz import write_npz
-    from humangs_jax.network.weights import load_weights
-    from humangs_jax.people.bank import build_bank, load_bank, save_bank
-    from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-    from humangs_jax.people.seeds import seeds_of
-
     folders = [out / f"{i:05d}" for i in range(count)]
     missing = [folder for folder in folders if not (folder / "views.npz").is_file()]
     if not missing:
@@ -148,17 +161,6 @@ class Sample:
 
 def read_sample(folder: Path) -> Sample:
     """What `make_samples` wrote."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.geometry.camera import Camera
-    from humangs_jax.io.npz import read_npz
-    from humangs_jax.refinement.learned import graph_of
-    from humangs_jax.refinement.objective import Photos
-    from humangs_jax.refinement.parameters import parameters_of
-
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     count = len(images)
@@ -182,12 +184,6 @@ def read_sample(folder: Path) -> Sample:
 @functools.cache
 def compiled(function: Any) -> Any:
     """Jitted; a configuration of splatting is static."""
-    import inspect
-
-    import jax
-
-    from humangs_jax.core.compiling import compiler_options
-
     static = [name for name in ("splat",) if name in inspect.signature(function).parameters]
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
@@ -196,11 +192,6 @@ def run_iterations(
     variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
 ) -> tuple[list[Any], list[Any]]:
     """Parameters side by side after each round, and the signals that each round saw."""
-    import jax
-    import jax.numpy as jnp
-
-    from humangs_jax.refinement.learned import Refiner, photo_signals, refiner_round, stacked, unstacked
-
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(iterations):
@@ -218,10 +209,6 @@ def run_iterations(
 
 def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
     """Gradient with respect to the variables, from those with respect to the parameters after each round."""
-    import jax
-    import jax.numpy as jnp
-
-    from humangs_jax.refinement.learned import Refiner, refiner_round
 
     def iterations(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
@@ -235,13 +222,6 @@ def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, 
 
 def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tuple[Any, Any]:
     """Loss of one view, relative to the person's share of the image; mean squared error."""
-    import jax.numpy as jnp
-
-    from humangs_jax.losses.ssim import structural_dissimilarity
-    from humangs_jax.refinement.learned import unstacked
-    from humangs_jax.refinement.objective import posed_gaussians
-    from humangs_jax.rendering.splatting import render
-
     drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.cameras, splat)
     terms = {
         "squared": jnp.square(drawn.rgb - view.images),
@@ -257,20 +237,12 @@ def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tup
 @functools.cache
 def view_gradient() -> Any:
     """((loss, squared error), gradient with respect to the parameters) of `view_loss`, jitted."""
-    import jax
-
-    from humangs_jax.core.compiling import compiler_options
-
     differentiated = jax.value_and_grad(view_loss, has_aux=True)
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())
 
 
 def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -> list[float]:
     """PSNR of views that are not among the photos, mean over samples, before and after each round."""
-    import numpy as np
-
-    from humangs_jax.refinement.learned import stacked
-
     rows = []
     for folder in folders:
         sample = read_sample(folder)
@@ -285,10 +257,6 @@ def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -
 
 def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: Any, seed: tuple[int, int]) -> Any:
     """Gradient of one sample, which the seed chooses: a new view for each round, two for the last one."""
-    import numpy as np
-
-    from humangs_jax.refinement.learned import stacked
-
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
     photos = int(rng.choice(COUNTS))
@@ -308,38 +276,27 @@ def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: A
     return compiled(through_iterations)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
 
 
-def train(folders: list[Path], validation: list[Path], arguments: argparse.Namespace) -> None:
+def train(folders: list[Path], validation: list[Path], out: Path, options: Refining) -> None:
     """From the first step, or from OUT/state.msgpack, to OUT/refiner.safetensors."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    import jax
-    import jax.numpy as jnp
-    import optax
-    from flax import serialization
-    from tqdm import tqdm
-
-    from humangs_jax.io.atomic import write_bytes
-    from humangs_jax.refinement.learned import Refiner, Signals, read_refiner, save_refiner, stacked
-
     sample = read_sample(folders[0])
     splat, values = planned([read_sample(folder) for folder in validation]), stacked(sample.start)
     nothing = Signals(jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values))))
     hidden = jnp.zeros((len(values), Refiner.width))
     variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3))
-    if arguments.start:
-        new, given = variables["params"], read_refiner(arguments.start)["params"]
+    if options.start:
+        new, given = variables["params"], read_refiner(options.start)["params"]
         if any(
             layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
             for layer, own in given.items()
         ):
-            raise ValueError(f"{arguments.start}: these are not weights of the network of a round")
+            raise ValueError(f"{options.start}: these are not weights of the network of a round")
         variables = {"params": new | given}
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, arguments.learning_rate, min(50, arguments.steps // 2), arguments.steps, 0.02 * arguments.learning_rate
+        0.0, options.learning_rate, min(50, options.steps // 2), options.steps, 0.02 * options.learning_rate
     )
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=1e-4))
     state: dict[str, Any] = {"variables": variables, "optimizer": optimizer.init(variables), "step": 0}
-    path = arguments.out / "state.msgpack"
+    path = out / "state.msgpack"
     if path.is_file():
         state = serialization.from_bytes(state, path.read_bytes())
 
@@ -348,15 +305,15 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
         change, optimizer_state = optimizer.update(gradient, optimizer_state, variables)
         return optax.apply_updates(variables, change), optimizer_state
 
-    bar = tqdm(initial=int(state["step"]), total=arguments.steps, desc="steps")
-    with bar, ThreadPoolExecutor(arguments.batch) as threads:
+    bar = tqdm(initial=int(state["step"]), total=options.steps, desc="steps")
+    with bar, ThreadPoolExecutor(options.batch) as threads:
         try:
-            while (step := int(state["step"])) < arguments.steps:
+            while (step := int(state["step"])) < options.steps:
                 if step % VALIDATE_EVERY == 0:
-                    dB = validate(state["variables"], validation, arguments.iterations, splat)
+                    dB = validate(state["variables"], validation, options.iterations, splat)
                     bar.write(f"step {step}: {dB} dB before and after each round")
-                one = functools.partial(step_gradient, state["variables"], folders, arguments.iterations, splat)
-                gradients = list(threads.map(one, [(step, i) for i in range(arguments.batch)]))
+                one = functools.partial(step_gradient, state["variables"], folders, options.iterations, splat)
+                gradients = list(threads.map(one, [(step, i) for i in range(options.batch)]))
                 gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
                 state = {"variables": variables, "optimizer": opt_state, "step": step + 1}
@@ -366,18 +323,14 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
         except KeyboardInterrupt:
             bar.write("interrupted: the same command goes on")
     write_bytes(path, serialization.to_bytes(jax.device_get(state)))
-    if int(state["step"]) == arguments.steps:
-        dB = validate(state["variables"], validation, arguments.iterations, splat)
-        print(f"step {arguments.steps}: {dB} dB before and after each round")
-        save_refiner(arguments.out / "refiner.safetensors", state["variables"])
+    if int(state["step"]) == options.steps:
+        dB = validate(state["variables"], validation, options.iterations, splat)
+        print(f"step {options.steps}: {dB} dB before and after each round")
+        save_refiner(out / "refiner.safetensors", state["variables"])
 
 
 def planned(samples: list[Sample]) -> Any:
     """Buffers that have room for every view of these samples."""
-    from humangs_jax.refinement.objective import posed_gaussians
-    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
-    from humangs_jax.rendering.splatting import plan_buffers
-
     like = SPLAT_PRESETS[samples[0].avatar.rendering]
     plans = [
         plan_buffers(posed_gaussians(sample.start, sample.avatar, view, poses=False), view.cameras, like, MARGIN)
@@ -386,7 +339,3 @@ def planned(samples: list[Sample]) -> Any:
     ]
     most = lambda name: max(getattr(plan, name) for plan in plans)
     return dataclasses.replace(plans[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"), visibility=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Train the network that comes with the package on synthetic people, from nothing to weights, in as many calls as it takes.
 
-    python experiments/training/train_shipped.py --out runs/shipped --hours 2
-    python experiments/training/train_shipped.py --out runs/more --init-weights shipped --people 480 --start-share 0.5
+    python experiments/train_shipped.py --out runs/shipped --hours 2
+    python experiments/train_shipped.py --out runs/more --init-weights shipped --people 480 --start-share 0.5
 
 The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
 Makes the people first: `--people` of the training seeds, rendered anew for every step, and 8 of the validation seeds. The same
@@ -24,7 +24,7 @@ import tyro
 from humangs_jax.core.processes import keep_freed_memory
 from humangs_jax.training.config import TrainConfig, small
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 VALIDATION_SUBJECTS = 8
 
@@ -62,7 +62,7 @@ def main(
     import jax
     import numpy as np
 
-    from experiments.training.grow import fit_variables
+    from experiments.grow import fit_variables
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import load_weights

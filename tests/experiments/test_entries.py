@@ -1,0 +1,56 @@
+"""Every experiment runs at its smallest size, and says what it found."""
+
+import json
+
+import jax
+import pytest
+
+from experiments.harness import call, listed
+
+PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
+CASES = {
+    "evaluation_view_selection": "--subjects 1",
+    "extremes": "--cases black",
+    "light": PEOPLE,
+    "loss_gradients": "--quick",
+    "masks": PEOPLE,
+    "reconstruction_benchmark": "--preset tiny --size 64 --views 2 --repeats 1 --memory 1 --memory-size 64",
+    "reconstruction_savings": "--preset tiny --size 64 --views 2 --repeats 1",
+    "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",
+    "splatting_finite_differences": "--size 32",
+    "splatting_scaling": "--size 64 --repeats 1 --sizes 32 64 --fractions 0.5 1 --views 1 2 --image FOLDER/a.png",
+    "splatting_stages": "--size 64 --repeats 1",
+    "splatting_tradeoff": "--size 64 --repeats 1 --only preset scale --image FOLDER/a.png",
+    "stability": "--networks shipped --types float32 --seeds 1",
+    "training_cost": "--preset tiny --chips v5e:1x1 --sizes 32 --variants kept",
+    "training_extremes": "--steps 6 --image FOLDER/a.png --only",
+    "training_steps": "--repeats 1 --only",
+}
+"""Options of each; the last words are given whole."""
+LAST = {"training_extremes": ["as it is", "float16 compute"], "training_steps": ["tiny 32"]}
+
+
+@pytest.fixture(autouse=True)
+def restored_options():
+    names = ("jax_enable_x64", "jax_enable_compilation_cache", "jax_disable_most_optimizations", "jax_platforms")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_it_runs(name, tmp_path, capsys):
+    options = [word.replace("FOLDER", str(tmp_path)) for word in CASES[name].split()] + LAST.get(name, [])
+    assert call(function_of(name), [*options, "--json", str(tmp_path / "out.json")]) == 0
+    assert "| " in capsys.readouterr().out
+    stored = json.loads((tmp_path / "out.json").read_text())
+    assert stored["numbers"] and stored["machine"]["cores"]
+    pictures = [word for word in options if word.startswith(str(tmp_path)) and word[-4:] in (".png", ".jpg")]
+    assert all((tmp_path / picture).is_file() for picture in pictures)
+
+
+def function_of(name):
+    module, _ = listed()[name]
+    return getattr(__import__(module, fromlist=[name]), name)
