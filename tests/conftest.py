@@ -1,4 +1,4 @@
-"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the record of slow runs.
+"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the shipped body.
 
 Environment variables:
 
@@ -9,10 +9,8 @@ HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `compiler_options.
 """
 
 import contextlib
-import datetime
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 from pathlib import Path
@@ -41,9 +39,6 @@ MAPPINGS = Path("/proc/self/maps")
 
 CACHE_BYTES = 1 << 30
 """Size to which the compile cache is cut before a run, oldest use first."""
-
-SLOW_RUNS = Path(__file__).parent / "slow_runs.json"
-"""When each slow test last ran, its seconds and its result: committed, written by `.ci/run slow`."""
 
 
 def cache_folder() -> Path:
@@ -107,30 +102,27 @@ def _forget_programs():
         jax.clear_caches()
 
 
-def pytest_configure(config):
-    config.pluginmanager.register(SlowRuns(), "slow_runs")
+@pytest.fixture(scope="session")
+def body():
+    """The body that comes with the package; modules that need another one have a fixture of this name."""
+    from humangs_jax.body.library import load_body
+
+    return load_body()
 
 
-class SlowRuns:
-    """Collects the slow tests that ran, in the process that all workers report to, and writes `SLOW_RUNS`."""
+@pytest.fixture(scope="session")
+def capture_folder(tmp_path_factory):
+    """A copy of the shipped capture: with its four photos, so that the demo's programs are compiled once for both."""
+    from humangs_jax.data.capture import load_capture, save_capture
 
-    def __init__(self):
-        self.runs = {}
+    path = tmp_path_factory.mktemp("captures") / "someone"
+    save_capture(path, load_capture("demo_capture"))
+    return path
 
-    def pytest_runtest_logreport(self, report):
-        if "slow" not in report.keywords:
-            return
-        run = self.runs.setdefault(report.nodeid, {"seconds": 0.0, "result": "passed"})
-        run["seconds"] += report.duration
-        if report.outcome != "passed" and run["result"] != "failed":
-            run["result"] = report.outcome
 
-    def pytest_sessionfinish(self, session):
-        if not self.runs or hasattr(session.config, "workerinput"):
-            return
-        known = json.loads(SLOW_RUNS.read_text()) if SLOW_RUNS.exists() else {}
-        today = datetime.datetime.now(datetime.UTC).date().isoformat()
-        for test, run in self.runs.items():
-            known[test] = {"date": today, "seconds": round(run["seconds"]), "result": run["result"]}
-        rows = ",\n".join(f"  {json.dumps(test)}: {json.dumps(known[test])}" for test in sorted(known))
-        SLOW_RUNS.write_text("{\n" + rows + "\n}\n")
+@pytest.fixture
+def humangs(monkeypatch, capsys):
+    """The command line in this process: humangs(words...) is (exit code, stdout, stderr)."""
+    from command_line import run
+
+    return lambda *words: run(monkeypatch, capsys, *words)

@@ -9,7 +9,6 @@ from rounding import bound
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.places import Place
 from humangs_jax.core.pytree import replace
@@ -18,11 +17,6 @@ from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPI
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images
 COARSER = 0.015  # metres: how far a vertex of a quarter of the mesh is from the best of the whole one
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 def at_rest(model):

@@ -22,11 +22,6 @@ STORED = 3e-5  # metres and weights: half a step of int16 or uint16, and the div
 
 
 @pytest.fixture(scope="module")
-def body():
-    return load_body()
-
-
-@pytest.fixture(scope="module")
 def joints(body):
     return dict(zip(JOINT_NAMES, np.asarray(shape_body(body, jnp.zeros(1)).joints), strict=True))
 

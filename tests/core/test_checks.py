@@ -1,11 +1,247 @@
-"""Checks of values: what passes, what is named, and that transformations are left alone."""
+"""What users hand in: wrong arguments and values are one line that says what came and what is expected."""
+
+import ast
+import dataclasses
+import re
+from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, POSITIVE, UNIT, check_values
+import humangs_jax as hg
+from humangs_jax.avatar.export.gaussians import write_ply
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
+from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, POSITIVE, UNIT, check_values, checked_arguments
+from humangs_jax.core.configuration import Presets, check_fields
+from humangs_jax.core.pytree import replace
+from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras
+from humangs_jax.network.runtime import Runtime
+
+COUNT = 7
+GAUSSIANS = hg.Gaussians(
+    jnp.zeros((COUNT, 3)), jnp.ones((COUNT, 4)), jnp.ones((COUNT, 3)), jnp.ones(COUNT), jnp.ones((COUNT, 3))
+)
+CAMERA = hg.Camera(jnp.eye(3), jnp.eye(4), 8, 8)
+POSE = hg.BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
+AVATAR = hg.Avatar(
+    GAUSSIANS,
+    jnp.ones((COUNT, 2)) / 2,
+    jnp.zeros((4, 3)),
+    jnp.zeros((2, 3)),
+    jnp.zeros((1, 3), int),
+    (-1, 0),
+    ("a", "b"),
+)
+AVATARS = jax.tree.map(lambda x: jnp.stack([x, x]), AVATAR)
+CAPTURE = hg.capture_from_arrays(
+    np.ones((1, 8, 8, 3)), np.eye(3)[None], np.eye(4)[None], np.zeros((1, 55, 3)), np.zeros((1, 3)), body=None
+)
+CONFIG = hg.HumanGSConfig()
+IMAGE = np.zeros((8, 8, 3), np.float32)
+
+
+def cut(name, size):
+    return replace(GAUSSIANS, **{name: getattr(GAUSSIANS, name)[:size]})
+
+
+WRONG = {
+    "avatar for Gaussians": (lambda: hg.render(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar; animate"),
+    "the same in jit": (lambda: jax.jit(hg.render)(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
+    "the other order": (lambda: hg.render(CAMERA, GAUSSIANS), "gaussians: expected Gaussians, got Camera"),
+    "a capture for a camera": (
+        lambda: hg.render(GAUSSIANS, CAPTURE),
+        "camera: expected Camera, got Capture; it has a batch",
+    ),
+    "nothing": (lambda: hg.render(GAUSSIANS, None), "camera: expected Camera, got None"),
+    "a class": (lambda: hg.render(GAUSSIANS, hg.Camera), "camera: expected Camera, got the class Camera"),
+    "too few": (lambda: hg.render(GAUSSIANS), r"render\(gaussians, camera, ...\): missing .* 'camera'"),
+    "no preset": (lambda: hg.render(GAUSSIANS, CAMERA, "fst"), "no preset 'fst': expected one of exact, near_exact"),
+    "a field": (
+        lambda: hg.render(GAUSSIANS, CAMERA, tile_size=4),
+        r"it is a field of SplatConfig, config=SplatConfig\(tile",
+    ),
+    "a field of refinement": (
+        lambda: hg.refine(AVATAR, CAPTURE, iterations=10),
+        r"^refine\(avatar, capture, ...\): no argument 'iterations': it is a field of RefineConfig, config=RefineConfig",
+    ),
+    "an unknown name": (
+        lambda: hg.render(GAUSSIANS, CAMERA, color=1),
+        "no argument 'color'; its arguments are gaussians, ",
+    ),
+    "reference": (lambda: hg.render_reference(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
+    "buffers": (lambda: hg.plan_buffers(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
+    "order of reconstruct": (
+        lambda: hg.reconstruct(CAPTURE, {}, CONFIG),
+        r"reconstruct\(variables, config, capture\): config: expected HumanGSConfig, got dict",
+    ),
+    "a batch for reconstruct": (lambda: hg.reconstruct({}, CONFIG, [CAPTURE]), "capture: expected Capture, got list"),
+    "one for a batch": (
+        lambda: hg.reconstruct_batch({}, CONFIG, CAPTURE),
+        "captures: expected Sequence, got Capture; a list of captures",
+    ),
+    "order of init": (lambda: hg.init_humangs(CONFIG, jax.random.key(0)), "config: expected HumanGSConfig, got "),
+    "order of skin": (lambda: hg.skin(POSE, AVATAR), "avatar: expected Avatar, got BodyPose"),
+    "a capture for a pose": (lambda: hg.animate(AVATAR, CAPTURE), "pose: expected BodyPose, got Capture; capture.pose"),
+    "a name of no preset": (
+        lambda: hg.reconstruct_with("real", {}, CONFIG, CAPTURE),
+        "settings 'real': expected Settings or",
+    ),
+    "an image": (lambda: hg.show(IMAGE), "avatar: expected Avatar, got ndarray"),
+    "no path": (lambda: write_ply(GAUSSIANS, "a.ply"), "path: expected str or PathLike, got Gaussians"),
+    "a batch of avatars": (
+        lambda: hg.animate(AVATARS, POSE),
+        r"avatar: expected one Avatar, got a batch \(2,\): take one",
+    ),
+    "a training of a network": (
+        lambda: hg.train(CONFIG, None, [], "x"),
+        "config: expected TrainConfig, got HumanGSConfig",
+    ),
+    "fewer colors": (
+        lambda: hg.render(cut("colors", 3), CAMERA),
+        r"gaussians.colors: expected shape \(7, 3\), got \(3, 3\)",
+    ),
+    "fewer opacities": (
+        lambda: hg.render(cut("opacities", 3), CAMERA),
+        r"opacities: expected shape \(7,\), got \(3,\)",
+    ),
+    "fewer in jit": (lambda: jax.jit(hg.render)(cut("scales", 3), CAMERA), r"scales: expected shape \(7, 3\)"),
+    "no intrinsics": (
+        lambda: hg.render(GAUSSIANS, replace(CAMERA, K=jnp.eye(4))),
+        r"camera.K: expected shape \(3, 3\)",
+    ),
+    "weights of others": (
+        lambda: hg.skin(replace(AVATAR, skinning_weights=jnp.ones((COUNT, 5))), POSE),
+        r"avatar.rest_joints: expected shape \(5, 3\), got \(2, 3\)",
+    ),
+    "a color": (lambda: hg.render(GAUSSIANS, CAMERA, background="blak"), "background 'blak': expected a color"),
+    "two numbers": (
+        lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0)),
+        r"background: expected 3 numbers .* got \(0, 0\)",
+    ),
+    "bytes": (
+        lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0, 255)),
+        r"background: expected 3 numbers in \[0, 1\]",
+    ),
+    "degrees": (lambda: intrinsics_from_fov(40.0, 8, 8), r"vertical_fov 40: expected radians .*np.deg2rad\(40\)"),
+    "degrees of an orbit": (
+        lambda: hg.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 30.0, jnp.eye(3), 8, 8),
+        "elevations 30.0: expected radians",
+    ),
+    "one camera": (
+        lambda: stack_cameras(CAMERA),
+        r"stack_cameras\(cameras\): cameras: expected Sequence, got Camera; a list of cameras",
+    ),
+    "a list of coefficients": (
+        lambda: shape_body(load_body(), [0.0]),
+        r"^shape_body\(body, betas\): betas: expected an array of shape \(s_used\), got list; jnp.asarray makes one",
+    ),
+    "a batch of coefficients": (
+        lambda: shape_body(load_body(), jnp.zeros((2, 3))),
+        r"betas: expected an array of shape \(s_used\), got \(2, 3\)",
+    ),
+    "a number for people": (
+        lambda: hg.evaluate(3),
+        r"^evaluate\(source, ...\): source: expected str or .* or Iterable, got int",
+    ),
+    "names for people": (lambda: hg.evaluate(iter([3])), "source: expected Cases, got a int among them"),
+    "as_trained": (lambda: hg.SPLAT_PRESETS["as_trained"], "no preset 'as_trained': .*SPLAT_PRESETS.avatar.rendering"),
+    "of training": (lambda: hg.PRESETS["tiny"], "no preset 'tiny': expected one of realtime, .*training.config"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments_are_named(name):
+    call, words = WRONG[name]
+    with pytest.raises((TypeError, ValueError, KeyError), match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "words"),
+    [
+        (hg.Settings(), {"splat": "fst"}, "Settings: splat: expected one of 'as_trained', .*, got 'fst'"),
+        (Runtime(), {"attention": "flash"}, "Runtime: attention: expected one of 'auto', 'xla', "),
+        (Runtime(), {"crop": "yes"}, "Runtime: crop: expected bool, got 'yes'"),
+        (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
+        (hg.SplatConfig(), {"matmul_precision": "float16"}, "matmul_precision: expected one of 'float32', 'bfloat16'"),
+        (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),
+        (
+            CONFIG.conventions,
+            {"tokens": "front"},
+            "Conventions: tokens: expected one of 'all', 'foreground', got 'front'",
+        ),
+        (CONFIG, {"runtime": "fast"}, "HumanGSConfig: runtime: expected Runtime, got 'fast'"),
+    ],
+)
+def test_wrong_fields_of_configurations_are_named(config, change, words):
+    """As `__init__` ends; it is not called here, because types are checked before it in tests."""
+    with pytest.raises(ValueError, match=words):
+        type(config).__post_init__(replace(config, **change))
+    type(config).__post_init__(config)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    number: float = 1.0
+    count: int | None = None
+    kind: Literal["a", "b"] | None = None
+    names: tuple[str, ...] = ()
+
+
+def test_numbers_of_any_library_are_numbers():
+    for fields in (Fields(), Fields(1, 3, "b", ("x",)), Fields(np.float32(2), np.int64(3)), Fields(np.float64(2))):
+        check_fields(fields)
+    for fields in (Fields(True), Fields("1"), Fields(count=True), Fields(kind="c"), Fields(names=["x"]), Fields(None)):
+        with pytest.raises(ValueError, match=r"^Fields: \w+: expected "):
+            check_fields(fields)
+
+
+@pytest.mark.slow
+def test_what_is_natural_is_accepted():
+    black = hg.render(GAUSSIANS, CAMERA, background=jnp.zeros(3)).rgb
+    for name in ("black", "#000000", (0, 0, 0), [0.0, 0.0, 0.0], np.zeros(3, np.float32)):
+        np.testing.assert_array_equal(hg.render(GAUSSIANS, CAMERA, background=name).rgb, black)
+    fast = hg.render(GAUSSIANS, CAMERA, hg.SPLAT_PRESETS["fast"]).rgb
+    np.testing.assert_array_equal(hg.render(GAUSSIANS, CAMERA, "fast").rgb, fast)
+    drawn = jax.jit(hg.render)(GAUSSIANS, CAMERA, hg.SPLAT_PRESETS["fast"])  # a configuration needs no static_argnums
+    np.testing.assert_allclose(drawn.rgb, fast, atol=1e-6)
+
+
+def test_decorated_functions_stay_what_they_are():
+    @checked_arguments
+    def written(path: str | Path, camera: hg.Camera | None = None, *, more: int = 3, **others):
+        """About it."""
+        return path, camera, more, others
+
+    assert written.__doc__ == "About it." and written.__name__ == "written"
+    assert written("a", None, more=4, other=5) == ("a", None, 4, {"other": 5})
+    assert written(Path("a"), CAMERA, more="no class to check")[2] == "no class to check"
+    with pytest.raises(TypeError, match=r"^written\(path, ...\): camera: expected Camera, got 'x'$"):
+        written("a", "x")
+
+
+def test_presets_are_dicts():
+    presets = Presets({"a": 1}, "; ask")
+    assert presets == {"a": 1} and "b" not in presets and presets.get("b") is None
+    with pytest.raises(KeyError, match="no preset 'b': expected one of a; ask"):
+        presets["b"]
+
+
+def test_errors_of_the_library_name_no_options():
+    """They are the command line's, which shows the name of an argument as an option."""
+    package, named, options = Path(hg.__file__).parent, [], set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if path.parent.name == "cli" and isinstance(node, ast.AnnAssign):
+                options.add(ast.unparse(node.target).replace("_", "-"))
+            elif path.parent.name != "cli" and isinstance(node, ast.Raise):
+                named += [(path.name, option) for option in re.findall(r"--([a-z-]+)", ast.unparse(node))]
+    assert len(options) > 100 and not [(name, option) for name, option in named if option in options]
 
 
 def test_what_is_right_passes():

@@ -29,14 +29,8 @@ def reachable(cls, found):
 
 
 ALL = set()
-for each in (
-    settings.Settings,
-    settings.FrontPoint,
-    config.TrainConfig,
-    settings.RefineConfig,
-    OnTheFlyConfig,
-    *_PARTS.values(),
-):
+CONFIGURATIONS = (settings.Settings, settings.FrontPoint, config.TrainConfig, settings.RefineConfig, OnTheFlyConfig)
+for each in (*CONFIGURATIONS, *_PARTS.values()):
     reachable(each, ALL)
 
 
@@ -109,26 +103,7 @@ def test_an_execution_is_checked_however_it_is_made():
             Runtime(**changes)
 
 
-HOSTILE = (
-    0,
-    -1,
-    1,
-    3,
-    10**6,
-    10**9,
-    2**63,
-    0.5,
-    -0.5,
-    1e-300,
-    1e300,
-    float("nan"),
-    float("inf"),
-    None,
-    True,
-    "x",
-    [],
-    {},
-)
+HOSTILE = (0, -1, 1, 3, 10**6, 10**9, 2**63, 0.5, -0.5, 1e-300, 1e300, np.nan, np.inf, None, True, "x", [], {})
 
 
 def leaves(value, path=()):

@@ -1,7 +1,7 @@
 """The evaluator from source to report: which views are compared, predictions by file name, and what is wrong in one line."""
 
+import functools
 import json
-import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -10,7 +10,6 @@ import pytest
 from evaluation_cases import capture_from, random_views, small_body
 
 import humangs_jax as hg
-from humangs_jax import cli
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
@@ -255,18 +254,9 @@ def test_a_source_gives_people(people):
     assert seen == [("0000", 0.0), ("0001", 0.0), ("0002", 0.0)] and len(found.rows) == 9
 
 
-def test_the_command(people, folders, tmp_path, monkeypatch, capsys):
+def test_the_command(people, folders, tmp_path, humangs):
     write_predictions(tmp_path / "theirs", people, alpha=True)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["humangs", "evaluate", *map(str, arguments)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as exit_:
-            code = exit_.code
-        return code, *capsys.readouterr()
-
+    run = functools.partial(humangs, "evaluate")
     out = tmp_path / "out"
     out.mkdir()
     options = ("--predictions", tmp_path / "theirs", "--protocol", "lhm++")
@@ -276,9 +266,7 @@ def test_the_command(people, folders, tmp_path, monkeypatch, capsys):
     assert code == 0, error
     assert "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
     code, printed, error = run(folders, *options, "--inputs", 2)
-    suggested = (
-        f"next: humangs evaluate {folders} --predictions {tmp_path / 'theirs'} --protocol lhm++ --inputs 2 --html"
-    )
+    suggested = f"next: humangs evaluate {folders} --predictions {tmp_path}/theirs --protocol lhm++ --inputs 2 --html"
     assert code == 0 and suggested in printed, printed
     assert json.loads((out / "a.json").read_text())["means"]["iou"]["count"] == 2
     wrong = {

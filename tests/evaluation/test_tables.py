@@ -61,15 +61,8 @@ def test_tables_of_people():
         markdown_table(["person", "PSNR"], [["a|b", "1.00"]]) == "| person | PSNR |\n| --- | ---: |\n| a\\|b | 1.00 |\n"
     )
     lines = latex_table(["person", "PSNR"], [["a_b & 5%", "1.00"], ["mean", "-"]]).splitlines()
-    assert (
-        lines[0] == r"\begin{tabular}{lr}"
-        and lines[4] == r"a\_b \& 5\% & 1.00 \\"
-        and lines[-2:]
-        == [
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-    )
+    assert lines[0] == r"\begin{tabular}{lr}" and lines[4] == r"a\_b \& 5\% & 1.00 \\"
+    assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]
 
 
 def test_the_csv_reads_back():
@@ -88,12 +81,10 @@ HOSTILE = (
     "\uff1d1",
     "\t=1",
     "<img src=x onerror=alert(1)>",
-    "[here](javascript:alert(1))",
     "a|b",
     "a\nb\x1b[2J",
-    "\\|`x`",
-    "\\input{secret}",
 )
+HOSTILE += ("[here](javascript:alert(1))", "\\|`x`", "\\input{secret}")
 
 
 @pytest.mark.parametrize("name", HOSTILE)

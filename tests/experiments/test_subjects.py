@@ -4,18 +4,12 @@ import numpy as np
 import pytest
 
 from experiments import subjects as people
-from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.people.writer import Layout, write_person
 
 SIZE = 48
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

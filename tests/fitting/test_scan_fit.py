@@ -8,7 +8,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.fitting.files import save_scan_fit
 from humangs_jax.fitting.residuals.priors import pose_prior
@@ -23,11 +22,6 @@ from humangs_jax.rendering.mesh.position_map import vertex_normals
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))
 QUICK = ScanFitConfig(samples=8000, points=700)
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

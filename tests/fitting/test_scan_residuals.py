@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.fitting.residuals.scan import (
     Given,
@@ -19,11 +18,6 @@ from humangs_jax.fitting.residuals.scan import (
     scan_residuals,
 )
 from humangs_jax.fitting.scan_search import start_state
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

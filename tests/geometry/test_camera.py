@@ -1,3 +1,5 @@
+"""Cameras, their transforms, and points along a curve."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +8,7 @@ import pytest
 from humangs_jax.geometry import camera as cameras
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, pixel_rays, plucker_rays
+from humangs_jax.geometry.transform import along_curve
 
 ATOL = 1e-5
 K = np.array([[100.0, 0, 16], [0, 110, 12], [0, 0, 1]])
@@ -110,3 +113,17 @@ def test_the_field_of_view_is_an_argument_of_transformations_too():
 
     assert np.isclose(jax.jit(focal)(0.7), focal(0.7), rtol=1e-6)
     assert np.isclose(jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2)  # of float32 differences
+
+
+def test_neighbours_along_the_curve_are_neighbours_in_space():
+    positions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (512, 3)), jnp.float32)
+    ranks = jax.jit(along_curve, static_argnums=1)(positions, 1.2)
+    assert sorted(ranks.tolist()) == list(range(512))
+    ordered = np.asarray(positions)[np.argsort(ranks)]
+    steps = np.linalg.norm(np.diff(ordered, axis=0), axis=-1).mean()
+    assert steps < 0.4 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).mean()
+
+
+def test_points_off_the_curve_are_on_its_border():
+    positions = jnp.asarray([[-9.0, -9.0, -9.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
+    assert along_curve(positions, 1.0).tolist() == [0, 1, 2]

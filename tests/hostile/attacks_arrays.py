@@ -4,8 +4,8 @@ import json
 import tempfile
 from pathlib import Path
 
+import honest_files
 import numpy as np
-import readers
 from hostile_cases import case
 
 from humangs_jax.body.library import save_body
@@ -36,12 +36,12 @@ def cast(name, dtype):
 
 
 def header(**changes):
-    return lambda arrays: arrays.update(header=json.dumps(readers.AVATAR_HEADER | changes))
+    return lambda arrays: arrays.update(header=json.dumps(honest_files.AVATAR_HEADER | changes))
 
 
 AVATARS = {
-    **{f"NaN in {name}": put(name, np.nan) for name in readers.avatar_arrays() if name != "faces"},
-    **{f"inf in {name}": put(name, -np.inf) for name in readers.avatar_arrays() if name != "faces"},
+    **{f"NaN in {name}": put(name, np.nan) for name in honest_files.avatar_arrays() if name != "faces"},
+    **{f"inf in {name}": put(name, -np.inf) for name in honest_files.avatar_arrays() if name != "faces"},
     "opacity 9": put("opacities", 9.0),
     "opacity -1": put("opacities", -1.0),
     "a negative scale": put("scales", -0.1),
@@ -72,13 +72,13 @@ AVATARS = {
 }
 for kind, change in AVATARS.items():
     item = 3 if "checksum" in kind else 7
-    arrays_case(kind, "avatar", readers.avatar_file, change, item)
-arrays_case("without a checksum", "avatar", readers.avatar_file, lambda arrays: None, 3, "read")
+    arrays_case(kind, "avatar", honest_files.avatar_file, change, item)
+arrays_case("without a checksum", "avatar", honest_files.avatar_file, lambda arrays: None, 3, "read")
 
 
 def body_file():
     with tempfile.TemporaryDirectory() as folder:
-        save_body(Path(folder) / "b.npz", readers.tiny_body())
+        save_body(Path(folder) / "b.npz", honest_files.tiny_body())
         with np.load(Path(folder) / "b.npz") as archive:
             return dict(archive)
 
@@ -106,7 +106,7 @@ SMPLX = {
     "no vertices": lambda arrays: arrays.update(v_template=np.zeros((0, 3))),
 }
 for kind, change in SMPLX.items():
-    arrays_case(kind, "smplx npz", readers.smplx_arrays, change, 7)
+    arrays_case(kind, "smplx npz", honest_files.smplx_arrays, change, 7)
 MOTION = {
     "NaN": put("poses", np.nan),
     "a rate of 0": lambda arrays: arrays.update(mocap_framerate=0.0),
@@ -139,7 +139,7 @@ FITS = {
     "one name": lambda arrays: arrays.update(names=np.asarray("x")),
 }
 for kind, change in FITS.items():
-    for reader, arrays in (("fit record", readers.fit_arrays), ("keypoints npz", readers.keypoint_arrays)):
+    for reader, arrays in (("fit record", honest_files.fit_arrays), ("keypoints npz", honest_files.keypoint_arrays)):
         arrays_case(kind, reader, arrays, change, 6, "either" if kind in ("NaN", "names of numbers") else "refused")
 BANKS = {
     "a seed of another split": put("seeds", 10**9),
@@ -153,7 +153,7 @@ BANKS = {
     "complex numbers": cast("texture", complex),
 }
 for kind, change in BANKS.items():
-    arrays_case(kind, "bank", readers.bank_arrays, change, 7)
+    arrays_case(kind, "bank", honest_files.bank_arrays, change, 7)
 
 
 # Numbers that no body has, and what float32 does not hold -------------------------------------------------------------
@@ -171,7 +171,7 @@ for kind, change in {
     ),
     "no joints": lambda arrays: arrays.update(rest_joints=np.zeros((0, 3), np.float32)),
 }.items():
-    arrays_case(kind, "avatar", readers.avatar_file, change)
+    arrays_case(kind, "avatar", honest_files.avatar_file, change)
 for kind, change in {
     "a template of 1e38": put("template", 1e38),
     "directions of 1e38": lambda arrays: arrays.update(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
@@ -185,7 +185,7 @@ for kind, change in {
     "weights of 1e38": put("weights", 1e38),
     "a regressor of 1e38": put("J_regressor", 1e38),
 }.items():
-    arrays_case(kind, "smplx npz", readers.smplx_arrays, change)
+    arrays_case(kind, "smplx npz", honest_files.smplx_arrays, change)
 own_motion = lambda: {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0}
 amass = lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}
 for value in (1e38, 1e300, 1e9):
@@ -197,8 +197,8 @@ for value in (1e38, 1e300, 1e9):
 
 def capture_of(key, value):
     def make(folder):
-        readers.write_capture(folder)
-        arrays = readers.body_parameters()
+        honest_files.write_capture(folder)
+        arrays = honest_files.body_parameters()
         arrays[key] = np.full(arrays[key].shape, value)
         np.savez(folder / "body.npz", **arrays)
         return folder
@@ -212,19 +212,19 @@ for value in (1e38, 1e300, -1e20, 1e6):
 
 
 for kind, name in {"a title": "\x1b]0;OWNED\x07", "a new line": "a\nb", "half a surrogate": "\ud800"}.items():
-    arrays_case(f"{kind} for a joint", "avatar", readers.avatar_file, header(joint_names=["a", "b", name]))
+    arrays_case(f"{kind} for a joint", "avatar", honest_files.avatar_file, header(joint_names=["a", "b", name]))
 
 
 RATES = {"10^9": 1e9, "10^-9": 1e-9, "10^300": 1e300, "10^-300": 1e-300, "1,001": 1001.0}
 for kind, rate in RATES.items():
     for reader in ("filmed", "motion npz"):
         arrays_case(
-            f"a rate of {kind}", reader, readers.motion_arrays, lambda a, r=rate: a.update(fps=np.asarray(r)), 5
+            f"a rate of {kind}", reader, honest_files.motion_arrays, lambda a, r=rate: a.update(fps=np.asarray(r)), 5
         )
 arrays_case(
     "300,000 frames",
     "filmed",
-    lambda: readers.motion_arrays(
+    lambda: honest_files.motion_arrays(
         rotations=np.zeros((300_000, 55, 3), np.float32), translations=np.zeros((300_000, 3), np.float32)
     ),
     lambda arrays: None,
@@ -233,7 +233,7 @@ arrays_case(
 arrays_case(
     "9,000 frames of 100 seconds each",
     "filmed",
-    lambda: readers.motion_arrays(rotations=np.zeros((9000, 55, 3)), translations=np.zeros((9000, 3)), fps=0.01),
+    lambda: honest_files.motion_arrays(rotations=np.zeros((9000, 55, 3)), translations=np.zeros((9000, 3)), fps=0.01),
     lambda arrays: None,
     5,
 )

@@ -4,7 +4,7 @@ import os
 import re
 import struct
 
-import readers
+import honest_files
 from attacks_photos import EPS, PHOTOS
 from hostile_cases import case, changed, huge, setting, written
 from PIL import Image
@@ -13,7 +13,7 @@ from PIL import Image
 
 
 def glb(change=lambda content: None, **options):
-    return written("scan.glb", lambda: readers.textured_glb(change=change, **options))
+    return written("scan.glb", lambda: honest_files.textured_glb(change=change, **options))
 
 
 def no_view(count):
@@ -85,7 +85,7 @@ def obj_with(texture=None, **options):
     def make(folder):
         if texture is not None:
             (folder / "texture.png").write_bytes(texture)
-        return readers.textured_obj(folder, **options)
+        return honest_files.textured_obj(folder, **options)
 
     return make
 
@@ -101,7 +101,7 @@ short, short_uvs = (
 case("vertices of one number", "obj", changed("obj", short), item=6)
 case("vertices of one number", "thuman scan", changed("thuman scan", short), item=6)
 case("texture coordinates of one number", "thuman scan", changed("thuman scan", short_uvs), "either", 6)
-case("a texture outside", "obj", lambda folder: readers.textured_obj(folder, "../../../../etc/passwd"), "read", 2)
+case("a texture outside", "obj", lambda folder: honest_files.textured_obj(folder, "../../../../etc/passwd"), "read", 2)
 MESHES = {
     "a corner of 2^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 1073741824\n" * 60),
     "a corner of 10^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + f"f 1 2 {10**30}\n" * 60),
@@ -191,7 +191,7 @@ case("1,000 parts with a texture of 9 million pixels", "glb", glb(repeated(1000)
 def obj_with_texture(place, texture="texture.png"):
     def make(folder):
         place(folder / texture)
-        return readers.textured_obj(folder, texture)
+        return honest_files.textured_obj(folder, texture)
 
     return make
 
@@ -202,17 +202,17 @@ TEXTURES = {
     "an endless device": lambda path: path.symlink_to("/dev/zero"),
     "a link to itself": lambda path: path.symlink_to(path),
     "nothing": lambda path: path.touch(),
-    "cut off": lambda path: path.write_bytes(readers.photo_bytes()[:200]),
+    "cut off": lambda path: path.write_bytes(honest_files.photo_bytes()[:200]),
     "a terabyte": huge,
 }
 for kind, place in TEXTURES.items():
     case(f"a texture that is {kind}", "obj", obj_with_texture(place), "read", 6)
-case("a texture without a name", "obj", lambda folder: readers.textured_obj(folder, ""), "read", 6)
-case("a texture that is cut off", "glb", glb(images=readers.photo_bytes()[:200]), item=6)
+case("a texture without a name", "obj", lambda folder: honest_files.textured_obj(folder, ""), "read", 6)
+case("a texture that is cut off", "glb", glb(images=honest_files.photo_bytes()[:200]), item=6)
 
 
 def nine_thousand_textures(folder):
-    path = readers.write_obj(folder)
+    path = honest_files.write_obj(folder)
     (folder / "scan.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd texture.png\n" for i in range(9000)))
     return path
 

@@ -3,11 +3,11 @@
 import json
 import os
 
+import honest_files
 import numpy as np
-import readers
+from honest_files import pixels
 from hostile_cases import case
 from PIL import Image
-from readers import pixels
 
 # Paths out of the folder -------------------------------------------------------------------------------------------------
 
@@ -16,9 +16,9 @@ def capture_that_names(key, value, prepare=lambda folder: None):
     def make(folder):
         inner = folder / "me"
         inner.mkdir()
-        readers.write_capture(inner)
+        honest_files.write_capture(inner)
         prepare(folder)
-        description = readers.capture_description()
+        description = honest_files.capture_description()
         if key == "body":
             description["body"] = value(folder) if callable(value) else value
         else:
@@ -32,7 +32,7 @@ def capture_that_names(key, value, prepare=lambda folder: None):
 def photo_outside(folder):
     Image.fromarray(pixels(12, 10, 3)).save(folder / "outside.png")
     Image.fromarray(pixels(12, 10)).save(folder / "mask.png")
-    np.savez(folder / "outside.npz", **readers.body_parameters())
+    np.savez(folder / "outside.npz", **honest_files.body_parameters())
 
 
 def linked(name, target):
@@ -76,11 +76,11 @@ def import_that_names(name, prepare=lambda folder: None):
     def make(folder):
         inner = folder / "in"
         inner.mkdir()
-        readers.write_import(inner)
+        honest_files.write_import(inner)
         photo_outside(folder)
         prepare(inner)
-        frames = [{"file_path": name, "transform_matrix": readers.POSE}]
-        (inner / "transforms.json").write_text(json.dumps(readers.transforms(frames=frames)))
+        frames = [{"file_path": name, "transform_matrix": honest_files.POSE}]
+        (inner / "transforms.json").write_text(json.dumps(honest_files.transforms(frames=frames)))
         return inner / "transforms.json"
 
     return make
@@ -96,9 +96,9 @@ case(
 
 def camera_named(name):
     def make(folder):
-        readers.write_import(folder)
+        honest_files.write_import(folder)
         (folder / "cameras.json").write_text(
-            json.dumps({name: {"K": readers.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}})
+            json.dumps({name: {"K": honest_files.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}})
         )
         return folder / "cameras.json"
 
@@ -116,9 +116,9 @@ def capture_of(count, prepare=lambda folder: None, image="images/000.png", **cha
     """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
 
     def make(folder):
-        readers.write_capture(folder)
+        honest_files.write_capture(folder)
         prepare(folder)
-        description = readers.capture_description()
+        description = honest_files.capture_description()
         view = {**description["views"][0], "frame": 0, **changes}
         del view["mask"]
         description["views"] = [view | {"image": image.format(i)} for i in range(count)]
@@ -168,7 +168,7 @@ for frame in (2_000_000_000, 10**30, 100_000, 1000):
 
 def folders(prepare):
     def make(folder):
-        place = readers.write_import_folder(folder)
+        place = honest_files.write_import_folder(folder)
         prepare(place / "photos")
         return place
 
@@ -178,8 +178,8 @@ def folders(prepare):
 def keypoint_folder(prepare):
     def make(folder):
         (folder / "keypoints").mkdir()
-        for name in readers.VIEWS:
-            (folder / "keypoints" / f"{name}_keypoints.json").write_text(readers.openpose())
+        for name in honest_files.VIEWS:
+            (folder / "keypoints" / f"{name}_keypoints.json").write_text(honest_files.openpose())
         prepare(folder / "keypoints")
         return folder / "keypoints"
 

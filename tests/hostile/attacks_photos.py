@@ -5,11 +5,11 @@ import struct
 import zlib
 from pathlib import Path
 
-import readers
+import honest_files
 from attacks_archives import deflated_zeros
+from honest_files import pixels
 from hostile_cases import case, written
 from PIL import Image
-from readers import pixels
 
 # Photos ---------------------------------------------------------------------------------------------------------------
 
@@ -112,7 +112,7 @@ for kind, (data, item) in PHOTOS.items():
 
 def capture_with_photo(data):
     def make(folder):
-        readers.write_capture(folder)
+        honest_files.write_capture(folder)
         (folder / "images" / "000.png").write_bytes(data)
         return folder
 

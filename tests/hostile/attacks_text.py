@@ -3,10 +3,10 @@
 import json
 import re
 
+import honest_files
 import numpy as np
-import readers
 from hostile_cases import case, changed, setting, written
-from readers import SEEDS
+from readers import FORMATS
 
 from humangs_jax.apps.settings import KIND, PRESETS
 from humangs_jax.core.configuration import config_to_json
@@ -63,8 +63,8 @@ YAML = {
     "a matrix of 10^18": "K_a: !!opencv-matrix\n   rows: 1000000000\n   cols: 1000000000\n   dt: d\n   data: [1]",
     "a matrix that is negative": "K_a: !!opencv-matrix\n   rows: -1\n   cols: -1\n   dt: d\n   data: [1]",
     "a matrix of .Inf": "K_a: !!opencv-matrix\n   rows: .Inf\n   cols: 1\n   dt: d\n   data: [1]",
-    "names that are a number": readers.opencv_yaml() + "names: 3\n",
-    "names of nobody": readers.opencv_yaml() + "names: [x, y]\n",
+    "names that are a number": honest_files.opencv_yaml() + "names: 3\n",
+    "names of nobody": honest_files.opencv_yaml() + "names: [x, y]\n",
 }
 for kind, data in YAML.items():
     case(kind, "opencv yaml", written("cameras.yml", "%YAML:1.0\n---\n" + data), item=5 if "digits" not in kind else 6)
@@ -87,15 +87,15 @@ for kind, bad in {
 }.items():
     matrix = [[bad, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     frames = [{"file_path": "a.png", "transform_matrix": matrix}]
-    json_case(f"a matrix with {kind}", "transforms", "transforms.json", readers.transforms(frames=frames))
-    json_case(f"a focal length of {kind}", "transforms", "transforms.json", readers.transforms(fl_x=bad))
-    json_case(f"a size of {kind}", "transforms", "transforms.json", readers.transforms(w=bad))
-    views = readers.capture_description()["views"]
+    json_case(f"a matrix with {kind}", "transforms", "transforms.json", honest_files.transforms(frames=frames))
+    json_case(f"a focal length of {kind}", "transforms", "transforms.json", honest_files.transforms(fl_x=bad))
+    json_case(f"a size of {kind}", "transforms", "transforms.json", honest_files.transforms(w=bad))
+    views = honest_files.capture_description()["views"]
     for key in ("K", "cam_from_world", "frame", "image"):
-        description = readers.capture_description(views=[{**views[0], key: bad}, views[1]])
+        description = honest_files.capture_description(views=[{**views[0], key: bad}, views[1]])
 
         def make(folder, description=description):
-            readers.write_capture(folder)
+            honest_files.write_capture(folder)
             (folder / "capture.json").write_text(json.dumps(description))
             return folder
 
@@ -106,7 +106,7 @@ for kind, bad in {
     json_case(f"a score of {kind}", "mmpose", "a.json", [{"keypoints": [[1, 2]] * 17, "keypoint_scores": [bad] * 17}])
     image = {"id": 1, "file_name": "000.png", "width": bad, "height": bad}
     json_case(f"a size of {kind}", "coco annotations", "a.json", {"images": [image], "annotations": []})
-    json_case(f"a pose of {kind}", "lhm", "a.json", json.loads(readers.lhm()) | {"root_pose": [bad] * 3})
+    json_case(f"a pose of {kind}", "lhm", "a.json", json.loads(honest_files.lhm()) | {"root_pose": [bad] * 3})
     json_case(f"a joint of {kind}", "joints json", "a.json", {"left_hip": [bad, 0, 0]})
 
 COLMAP = {
@@ -125,7 +125,7 @@ COLMAP = {
 for kind, (name, old, new) in COLMAP.items():
 
     def make(folder, name=name, old=old, new=new):
-        readers.write_colmap(folder)
+        honest_files.write_colmap(folder)
         text = (folder / name).read_text()
         assert old in text
         (folder / name).write_text(text.replace(old, new, 1))
@@ -175,7 +175,7 @@ def weights_with(path, value):
         from safetensors import safe_open
         from safetensors.numpy import save_file
 
-        file = SEEDS["weights"](folder)
+        file = FORMATS["weights"].make(folder)
         with safe_open(file, "numpy") as content:
             tensors, metadata = {key: content.get_tensor(key) for key in content.keys()}, content.metadata()  # noqa: SIM118
         architecture = json.loads(metadata["architecture"])
@@ -192,7 +192,7 @@ for kind, (path, value, item) in CONFIGURATIONS.items():
 
 
 def weights_changed(folder):
-    file = SEEDS["weights"](folder)
+    file = FORMATS["weights"].make(folder)
     data = bytearray(file.read_bytes())
     data[-7] ^= 1
     file.write_bytes(data)
@@ -287,12 +287,12 @@ WORDS = {
     "half a surrogate": "\udc9b",
 }
 for kind, word in WORDS.items():
-    views = readers.capture_description()["views"]
+    views = honest_files.capture_description()["views"]
     for key in ("image", "mask"):
-        description = readers.capture_description(views=[{**views[0], key: f"images/{word}.png"}, views[1]])
+        description = honest_files.capture_description(views=[{**views[0], key: f"images/{word}.png"}, views[1]])
 
         def make(folder, description=description):
-            readers.write_capture(folder)
+            honest_files.write_capture(folder)
             (folder / "capture.json").write_text(json.dumps(description))
             return folder
 
@@ -300,7 +300,7 @@ for kind, word in WORDS.items():
             case(f"{kind} in {key}", reader, make)
 
     def make(folder, word=word):
-        readers.write_colmap(folder)
+        honest_files.write_colmap(folder)
         text = (folder / "images.txt").read_text()
         (folder / "images.txt").write_text(
             text.replace("0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", 1), errors="replace"
@@ -310,14 +310,14 @@ for kind, word in WORDS.items():
     case(f"{kind} in a name", "colmap", make)
 
     def make(folder, word=word):
-        path = SEEDS["bvh"](folder)
+        path = FORMATS["bvh"].make(folder)
         text = path.read_text()
         path.write_text(text.replace("CHANNELS", word, 1), errors="replace")
         return path
 
     case(f"{kind} in a word", "bvh", make)
     frames = [{"file_path": word, "transform_matrix": [1]}]
-    json_case(f"{kind} in a path", "transforms", "transforms.json", readers.transforms(frames=frames))
+    json_case(f"{kind} in a path", "transforms", "transforms.json", honest_files.transforms(frames=frames))
     json_case(f"{kind} in a name", "coco", "a.json", [{"file_name": word, "keypoints": [1]}])
     json_case(f"{kind} in a key", "joints json", "a.json", {word: [0, 0]})
     json_case(f"{kind} in a field", "configuration", "config.json", {word: 1})
@@ -362,8 +362,8 @@ for key, values in {
 }.items():
     for value in values:
         named = "10^400" if isinstance(value, int) and value > 9 else repr(value)
-        json_case(f"{key} {named}", "manifest", "manifest.json", readers.MANIFEST | {key: value})
-without = {key: value for key, value in readers.MANIFEST.items() if key != "settings"}
+        json_case(f"{key} {named}", "manifest", "manifest.json", honest_files.MANIFEST | {key: value})
+without = {key: value for key, value in honest_files.MANIFEST.items() if key != "settings"}
 json_case("no settings", "manifest", "manifest.json", without)
 
 NOBODY = '{"pose_keypoints_2d":[]}'

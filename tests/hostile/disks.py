@@ -155,7 +155,6 @@ def pair(command: Command, folder: Path, inputs: Path) -> list[str]:
 
 def main():
     folder, names = Path(sys.argv[1]), sys.argv[2:]
-    writers.import_everything()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     inputs = folder / "inputs"

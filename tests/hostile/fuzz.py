@@ -60,88 +60,24 @@ NUMBERS = [
     1e30,
     1e400,
     -1e400,
-    float("nan"),
+    np.nan,
 ]
-VALUES = [
-    *NUMBERS,
-    None,
-    True,
-    "",
-    "x",
-    "..",
-    "../x",
-    "/",
-    "a\0b",
-    "1",
-    "nan",
-    [],
-    {},
-    [1, [2]],
-    {"a": 1},
-    [[]] * 9,
-    [0.0] * 51,
-]
+VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
+VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
 SIZES = (0, 1, 2, 3, 4, 5, 9, 17, 55, 165)
 WORDS = [
-    *(
-        b"nan",
-        b"inf",
-        b"-1",
-        b"0",
-        b"1e400",
-        b"99999999999999999999",
-        b"9" * 400,
-        b"x",
-        b"",
-        b"\0",
-        b"\xff",
-        b"\n",
-        b"[",
-        b"{",
-        b"-",
-    ),
-    *(
-        b": ",
-        b"!!opencv-matrix",
-        b"!!python/object",
-        b"&a",
-        b"*a",
-        b"%YAML:1.0",
-        b"#",
-        b"/",
-        b"..",
-        b"f 1 2 3",
-        b"v 1 2 3",
-    ),
+    *b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()
 ]
+WORDS += [b"9" * 400, b"", b"\0", b"\xff", b"\n", b": ", b"f 1 2 3", b"v 1 2 3"]
 OPCODES = [bytes([each.code.encode("latin1")[0]]) for each in pickletools.opcodes]
-NAMES = [
-    *(
-        ("numpy", "dtype"),
-        ("numpy", "ndarray"),
-        ("numpy.core.multiarray", "_reconstruct"),
-        ("numpy.core.multiarray", "scalar"),
-    ),
-    *(
-        ("numpy._core.numeric", "_frombuffer"),
-        ("_codecs", "encode"),
-        ("scipy.sparse", "csc_matrix"),
-        ("chumpy.ch", "Ch"),
-    ),
-    *(
-        ("chumpy.reordering", "Select"),
-        ("copyreg", "_reconstructor"),
-        ("collections", "OrderedDict"),
-        ("torch", "FloatStorage"),
-    ),
-    *(
-        ("torch._utils", "_rebuild_tensor_v2"),
-        ("torch._utils", "_rebuild_parameter"),
-        ("os", "system"),
-        ("builtins", "object"),
-    ),
-]
+STACK = [b"0", b"2", b"(", b"R", b"b", b"\x81", b"\x85", b"\x86", b"t", b"s", b"u", b"e"]
+CONSTANTS = [b"J" + struct.pack("<i", n) for n in (-1, 0, 7, 2**31 - 1)]
+CONSTANTS += [b"N", b"}", b"]", b")", b"X\1\0\0\0<", b"\x88"]
+NAMES = """numpy dtype, numpy ndarray, numpy.core.multiarray _reconstruct, numpy.core.multiarray scalar, numpy._core.numeric
+_frombuffer, _codecs encode, scipy.sparse csc_matrix, chumpy.ch Ch, chumpy.reordering Select, copyreg _reconstructor, collections
+OrderedDict, torch FloatStorage, torch._utils _rebuild_tensor_v2, torch._utils _rebuild_parameter, os system, builtins object"""
+NAMES = [each.split() for each in NAMES.split(",")]
 
 
 class Draw:
@@ -240,12 +176,10 @@ def mutated_array(array, draw):
         bad = (0, 1, 9, 99) if array.dtype.kind in "iu" else (np.nan, np.inf, -np.inf, -1.0, 6e4)
         array.reshape(-1)[draw.below(array.size)] = draw.of(bad)
         return array
+    if way == 2 and array.dtype.kind in "fiub":
+        return array.astype(draw.of(DTYPES[:9]), copy=False)
     if way == 2:
-        return (
-            array.astype(draw.of(DTYPES[:9]), copy=False)
-            if array.dtype.kind in "fiub"
-            else np.asarray(draw.of(("", "x", "\0")))
-        )
+        return np.asarray(draw.of(("", "x", "\0")))
     if way == 3:
         return array[None]
     return array[: draw.below(len(array) + 1)] if array.ndim else np.zeros(3)
@@ -283,21 +217,9 @@ def mutated_pickle(data, draw):
         elif way == 3:
             pieces[at] = b"c" + "\n".join((*draw.of(NAMES), "")).encode()
         elif way == 4:
-            pieces[at] = draw.of(
-                (
-                    b"J" + struct.pack("<i", draw.of((-1, 0, 7, 2**31 - 1))),
-                    b"N",
-                    b"}",
-                    b"]",
-                    b")",
-                    b"X\1\0\0\0<",
-                    b"\x88",
-                )
-            )
+            pieces[at] = draw.of(CONSTANTS)
         else:
-            pieces[at:at] = [
-                draw.of((b"0", b"2", b"(", b"R", b"b", b"\x81", b"\x85", b"\x86", b"t", b"s", b"u", b"e"))
-            ] * (1 + draw.below(30))
+            pieces[at:at] = [draw.of(STACK)] * (1 + draw.below(30))
         pieces = pieces or [b"."]
     return b"".join(pieces)
 
@@ -347,13 +269,8 @@ def mutated_glb(data, draw):
     length = struct.unpack_from("<I", data, 12)[0]
     header = json.dumps(mutated_value(json.loads(data[20 : 20 + length]), draw)).encode()
     header += b" " * (-len(header) % 4)
-    rest = data[20 + length :]
-    return (
-        struct.pack("<III", 0x46546C67, 2, 20 + len(header) + len(rest))
-        + struct.pack("<II", len(header), 0x4E4F534A)
-        + header
-        + rest
-    )
+    chunks = struct.pack("<II", len(header), 0x4E4F534A) + header + data[20 + length :]
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
 
 
 def mutated_safetensors(data, draw):
@@ -369,47 +286,22 @@ def mutated_safetensors(data, draw):
     return struct.pack("<Q", len(header)) + header + rest
 
 
-NPZ = (
-    "npz",
-    "smplx npz",
-    "hands",
-    "body",
-    "avatar",
-    "keypoints npz",
-    "motion npz",
-    "amass",
-    "thuman",
-    "joints npz",
-    "fit record",
-    "bank",
-    "video poses",
-    "scene arrays",
-)
-STRUCTURES = {
-    **dict.fromkeys(NPZ, mutated_npz),
-    **dict.fromkeys(
-        ("json", "configuration", "transforms", "opencv json", "openpose", "coco", "coco annotations"), mutated_json
-    ),
-    **dict.fromkeys(
-        ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "boundary", "import"), mutated_json
-    ),
-    **dict.fromkeys(
-        ("avatarrex", "scene list", "evaluation", "preprocessed set", "preprocessed scene", "skipped subject"),
-        mutated_json,
-    ),
-    **dict.fromkeys(("pickle", "smplx pkl", "aist", "thuman fit"), mutated_pickle),
-    "image": mutated_png,
-    **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log", "bvh"), mutated_text),
-    **dict.fromkeys(("missing photos", "actorshq", "thuman mesh", "thuman scan"), mutated_text),
-    **{
-        "torch zip": mutated_zip,
-        "glb": mutated_glb,
-        "glb motion": mutated_glb,
-        "safetensors": mutated_safetensors,
-        "weights": mutated_safetensors,
-    },
+KINDS = {
+    mutated_npz: "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, joints npz, fit record, bank, "
+    "video poses, scene arrays",
+    mutated_json: "json, configuration, transforms, opencv json, openpose, coco, coco annotations, mmpose, lhm, joints json, "
+    "manifest, capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set, preprocessed scene, "
+    "skipped subject",
+    mutated_pickle: "pickle, smplx pkl, aist, thuman fit",
+    mutated_text: "opencv yaml, easymocap, colmap, obj, off, log, bvh, missing photos, actorshq, thuman mesh, thuman scan",
+    mutated_png: "image",
+    mutated_zip: "torch zip",
+    mutated_glb: "glb, glb motion",
+    mutated_safetensors: "safetensors, weights",
 }
+STRUCTURES = {name: mutated for mutated, names in KINDS.items() for name in names.split(", ")}
 """How the files of a reader are taken apart; those of the others change by bytes alone."""
+assert set(STRUCTURES) <= set(readers.FORMATS)
 
 
 def checked(read, path, watch):
@@ -435,8 +327,8 @@ def fuzz(name, folder, inputs, number, watch):
     place = folder / name.replace(" ", "_")
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
-    path = readers.SEEDS[name](place)
-    file = readers.damaged_file(name, path)
+    path = readers.FORMATS[name].make(place)
+    file = readers.FORMATS[name].damaged(path)
     honest, counts = file.read_bytes(), {"read": 0, "refused": 0}
 
     @seed(number)
@@ -456,7 +348,7 @@ def fuzz(name, folder, inputs, number, watch):
             content = mutated_bytes(honest, draw)
         file.write_bytes(content)
         try:
-            counts[checked(readers.READERS[name], path, watch)] += 1
+            counts[checked(readers.FORMATS[name].read, path, watch)] += 1
         except AssertionError:
             (folder / f"found-{name.replace(' ', '_')}").write_bytes(content)
             raise
@@ -477,7 +369,7 @@ def main():
     parser.add_argument("--record", type=Path)
     parser.add_argument("--page", type=Path, help="page whose table fuzz is written, with its docs/results/fuzz.json")
     arguments = parser.parse_args()
-    folder, names = arguments.folder, arguments.readers or [name for name, make in readers.SEEDS.items() if make]
+    folder, names = arguments.folder, arguments.readers or [name for name, each in readers.FORMATS.items() if each.make]
     record_file = arguments.record or folder / "record.json"
     published = arguments.page and arguments.page.parent / "results" / "fuzz.json"
     record = json.loads(record_file.read_text()) if record_file.exists() else {}
@@ -518,10 +410,8 @@ def write_page(page, figures):
 
     total = lambda key: sum(each[key] for each in figures.values())
     header = ["readers", "mutated files", "fewest of a reader", "read", "refused in one line", "anything else"]
-    fewest, found = (
-        min(each["inputs"] for each in figures.values()),
-        sum(bool(each["found"]) for each in figures.values()),
-    )
+    fewest = min(each["inputs"] for each in figures.values())
+    found = sum(bool(each["found"]) for each in figures.values())
     rows = [[len(figures), f"{total('inputs'):,}", f"{fewest:,}", f"{total('read'):,}", f"{total('refused'):,}", found]]
     publish(page, "fuzz", markdown_table(header, rows, "r" * len(header)), figures)
 

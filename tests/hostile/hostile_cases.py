@@ -9,12 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from readers import SEEDS, damaged_file
+from honest_files import written as written
+from readers import FORMATS
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """reader: of `readers.READERS`. make: writes the file into a folder, returns its path. item: of test_hostile.ITEMS."""
+    """reader: of `readers.FORMATS`. make: writes the file into a folder, returns its path. item: of test_hostile.ITEMS."""
 
     name: str
     reader: str
@@ -31,17 +32,6 @@ def case(name, reader, make, expect="refused", item=0):
     assert f"{reader}: {name}" not in NAMES, f"two cases {reader}: {name}"
     NAMES.add(f"{reader}: {name}")
     CASES.append(Case(f"{reader}: {name}", reader, make, expect, item))
-
-
-def written(name, data):
-    """Makes a file of bytes, of text, or of what a function returns."""
-
-    def make(folder):
-        content = data() if callable(data) else data
-        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-        return folder / name
-
-    return make
 
 
 def setting(path, value):
@@ -63,8 +53,8 @@ def changed(name, change):
     """The honest file of a reader, its bytes changed."""
 
     def make(folder):
-        path = SEEDS[name](folder)
-        file = damaged_file(name, path)
+        path = FORMATS[name].make(folder)
+        file = FORMATS[name].damaged(path)
         file.write_bytes(change(file.read_bytes()))
         return path
 
@@ -75,8 +65,8 @@ def replaced(name, place):
     """The honest file of a reader, something else in its place."""
 
     def make(folder):
-        path = SEEDS[name](folder)
-        file = damaged_file(name, path)
+        path = FORMATS[name].make(folder)
+        file = FORMATS[name].damaged(path)
         file.unlink()
         place(file)
         return path
@@ -117,7 +107,7 @@ PLACES = {
 NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start"}
 """Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again."""
 
-for seed in (name for name, make in SEEDS.items() if make is not None):
+for seed in (name for name, each in FORMATS.items() if each.make is not None):
     for kind, change in NONSENSE.items():
         case(kind, seed, changed(seed, change), "either" if seed in NOT_NOTICED else "refused")
     for kind, place in PLACES.items():

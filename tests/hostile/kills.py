@@ -111,7 +111,6 @@ def interrupt(command: Command, folder: Path, inputs: Path, count: int, seed: in
 
 def interrupt_all(folder: Path, count: int, names: list[str], record: Path | None = None) -> dict[str, dict]:
     """Figures by command. The record grows by `TURN` interrupts at a time until each command has the number asked for."""
-    writers.import_everything()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     writers.prepare(folder / "inputs")
@@ -138,7 +137,6 @@ def interrupt_all(folder: Path, count: int, names: list[str], record: Path | Non
 
 def kill_all(folder: Path, count: int, names: list[str], record: Path | None = None, seed: int = 0) -> dict[str, dict]:
     """Figures by command. A record is continued: commands that are killed again replace what it has of them."""
-    writers.import_everything()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     writers.prepare(folder / "inputs")

@@ -1,6 +1,8 @@
-"""Hostile files: read in a process of their own, each ends in one line, in bounded memory and time, and nothing else happens.
+"""Hostile files end in one line, in bounded memory and time, and nothing else happens; every command that writes loses nothing.
 
-`python tests/hostile/test_hostile.py FOLDER` runs them and prints the figures of docs/security.md.
+Some files of each item are read here, all of them in a process of their own (`worker`), by the slow tests. So are the commands:
+killed, on full and read-only disks, twice at once (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
+prints the figures of docs/security.md.
 """
 
 import json
@@ -15,6 +17,11 @@ import pytest
 from humangs_jax.core.progress import printable
 
 HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
+
+from hostile_cases import all_cases  # noqa: E402
+from readers import FORMATS  # noqa: E402
+
 WORKER_SECONDS = 1800
 LONGEST_LINE = 1500
 ITEMS = {
@@ -27,6 +34,21 @@ ITEMS = {
     7: "arrays of avatars and bodies",
 }
 """Of the list that these tests began with; 8 is tests/io/test_atomic.py, 9 the checks of arrays in tests/avatar."""
+CASES = all_cases()
+FUZZED, MOMENTS = (int(os.environ.get(*each)) for each in (("HUMANGS_FUZZ_INPUTS", "10000"), ("HUMANGS_KILLS", "2")))
+"""Files for each reader, and kills and interrupts of each command; docs/results has the figures of more."""
+EVERY = 12
+HEAVY = (
+    *("GiB", "million", "bomb", "100,000", "100 MB", "digits", "8,000", "13,000", "30,000", "60,000,000", "300,000"),
+    *("5,000 photos", "white photos", "scans", "nodes", "MB"),
+)
+"""Files that a reader which has become careless would take minutes or gigabytes for."""
+
+
+def program(script: str, *arguments: object, seconds: float | None = None) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, str(HERE / script), *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=seconds, check=False)
 
 
 def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
@@ -36,12 +58,8 @@ def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
         place = folder / f"run{attempt}"
         place.mkdir(parents=True)
         (place / "names.json").write_text(json.dumps(waiting))
-        command = [sys.executable, str(HERE / "worker.py"), str(place), str(place / "names.json")]
-        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"}
         try:
-            done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=WORKER_SECONDS, check=False
-            )
+            done = program("worker.py", place, place / "names.json", seconds=WORKER_SECONDS)
             ending, errors = f"exit status {done.returncode}", done.stderr[-2000:]
         except subprocess.TimeoutExpired:
             ending, errors = "did not end", ""
@@ -54,22 +72,10 @@ def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
         if begun is None and len(waiting) == len([name for name in waiting if name not in results]):
             raise RuntimeError(f"the worker read nothing: {ending}\n{errors}")
         if begun is not None:
-            results[begun] = {
-                "name": begun,
-                "outcome": "died",
-                "message": f"{ending} {errors[-300:]}",
-                "path": "",
-                "seconds": 0,
-            }
+            died = {"outcome": "died", "message": f"{ending} {errors[-300:]}", "path": "", "seconds": 0}
+            results[begun] = {"name": begun} | died
         waiting, attempt = [name for name in waiting if name not in results], attempt + 1
     return results
-
-
-def all_cases():
-    sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
-    import hostile_cases
-
-    return hostile_cases.all_cases()
 
 
 def fault(case, result: dict) -> str:
@@ -87,9 +93,30 @@ def fault(case, result: dict) -> str:
     return ""
 
 
-CASES = all_cases()
-READERS = sorted({case.reader for case in CASES})
-FUZZED = int(os.environ.get("HUMANGS_FUZZ_INPUTS", "10000"))
+def test_there_are_enough():
+    assert len(CASES) >= 400
+
+
+@pytest.mark.parametrize("item", ITEMS)
+def test_some_files_of_each_item(item, tmp_path):
+    light = [case for case in CASES if case.item == item and not any(word in case.name for word in HEAVY)]
+    faults = []
+    for number, case in enumerate(light[::EVERY] if len(light) > 60 else light):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = case.make(folder)
+        result = {"outcome": "read", "message": "", "path": str(path)}
+        try:
+            FORMATS[case.reader].read(path)
+        except (ValueError, OSError) as error:
+            result |= {"outcome": "refused", "message": str(error)}
+        faults.append(fault(case, result))
+    assert faults and not any(faults), "\n".join(filter(None, faults))
+
+
+@pytest.mark.parametrize("name", [name for name, each in FORMATS.items() if each.make is not None])
+def test_honest_files_are_read(name, tmp_path):
+    FORMATS[name].read(FORMATS[name].make(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -98,42 +125,59 @@ def results(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("reader", sorted({case.reader for case in CASES}))
 def test_every_file_ends_in_one_line(results, reader):
     faults = [fault(case, results[case.name]) for case in CASES if case.reader == reader]
     assert not any(faults), "\n".join(filter(None, faults))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("item", ITEMS)
-def test_each_item_of_the_list_stays_closed(results, item):
-    mine = [case for case in CASES if case.item == item]
-    assert mine and not any(fault(case, results[case.name]) for case in mine)
-
-
-def test_there_are_enough():
-    assert len(CASES) >= 400
-
-
-@pytest.mark.slow
 def test_the_fuzzer_finds_nothing(tmp_path):
-    command = [sys.executable, str(HERE / "fuzz.py"), str(tmp_path), str(FUZZED)]
-    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = program("fuzz.py", tmp_path, FUZZED)
     assert done.returncode == 0, done.stderr[-2000:]
     figures = json.loads(done.stdout.splitlines()[-1])
     assert not {name: each["found"] for name, each in figures.items() if each["found"]}
     assert len(figures) >= 45 and all(each["inputs"] >= FUZZED for each in figures.values())
 
 
+@pytest.mark.slow
+def test_killed_at_any_moment_nothing_is_half_written_or_lost_and_the_next_run_works(tmp_path):
+    record = tmp_path / "kills.json"
+    done = program("kills.py", tmp_path / "kills", "--moments", MOMENTS, "--json", record)
+    assert record.exists(), done.stderr[-3000:]
+    commands = json.loads(record.read_text())["commands"]
+    assert not {name: each["faults"] for name, each in commands.items() if each["faults"]}
+    assert done.returncode == 0 and len(commands) >= 25
+    killed = sum(each["killed"] for each in commands.values())
+    assert killed > MOMENTS * len(commands) / 2  # some come to their end before
+
+
+@pytest.mark.slow
+def test_interrupted_at_any_moment_a_command_exits_with_130_and_leaves_nothing(tmp_path):
+    record = tmp_path / "interrupts.json"
+    done = program("kills.py", tmp_path / "kills", "--interrupts", MOMENTS, "--json", record)
+    figures = json.loads(record.read_text())
+    assert not {name: each["faults"] for name, each in figures.items() if each["faults"]}
+    assert done.returncode == 0 and len(figures) >= 25, done.stderr[-3000:]
+
+
+@pytest.mark.slow
+def test_full_and_read_only_disks_and_two_runs_at_once_end_in_one_line_and_lose_nothing(tmp_path):
+    done = program("disks.py", tmp_path / "disks")
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert not [each for each in found if any(each.values())]
+    assert done.returncode == 0 and len(found) >= 25, done.stderr[-3000:]
+
+
 def main():
     results = run_cases(Path(sys.argv[1]), [case.name for case in CASES])
     faults = [text for case in CASES if (text := fault(case, results[case.name]))]
     print("\n".join(faults))
-    slow = sorted(results.values(), key=lambda result: -result["seconds"])[:8]
-    print("\n".join(f"{each['seconds']:.2f} s  {each['name']}" for each in slow))
-    large = sorted(results.values(), key=lambda result: -result.get("bytes", 0))[:8]
-    print("\n".join(f"{each.get('bytes', 0) >> 20} MiB  {each['name']}" for each in large))
+    for key, unit in (("seconds", 1), ("bytes", 1 << 20)):
+        most = sorted(results.values(), key=lambda result, key=key: -result.get(key, 0))[:8]
+        print(
+            "\n".join(f"{each.get(key, 0) / unit:.2f} {key if unit == 1 else 'MiB'}  {each['name']}" for each in most)
+        )
     print(Counter(result["outcome"] for result in results.values()))
     print(f"{len(CASES)} files, {len({case.reader for case in CASES})} readers, {len(faults)} faults")
 

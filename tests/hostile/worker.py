@@ -139,11 +139,11 @@ def prepare():
 
 def warm_up(readers, folder):
     """Reads every honest file once; what is wrong with one is raised."""
-    for name, seed in readers.SEEDS.items():
-        if seed is not None:
+    for name, each in readers.FORMATS.items():
+        if each.make is not None:
             place = folder / "honest" / name.replace(" ", "_")
             place.mkdir(parents=True)
-            readers.READERS[name](seed(place))
+            each.read(each.make(place))
 
 
 def main():
@@ -160,7 +160,7 @@ def main():
             results.write(json.dumps({"begun": case.name}) + "\n")
             place = folder / f"case{number}"
             place.mkdir()
-            results.write(json.dumps(run(case, readers.READERS[case.reader], place, watch)) + "\n")
+            results.write(json.dumps(run(case, readers.FORMATS[case.reader].read, place, watch)) + "\n")
 
 
 if __name__ == "__main__":

@@ -7,18 +7,12 @@ import numpy as np
 import pytest
 
 from experiments.people import check_people, contact_sheets
-from humangs_jax.body.library import load_body
 from humangs_jax.people import cameras
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.people.subject import make_subject
 from humangs_jax.people.writer import sample_pose
 
 SIZE = 96
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

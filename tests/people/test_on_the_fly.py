@@ -43,11 +43,6 @@ between, dyes = jax.jit(quaternion.interpolate), jax.jit(shading.dyes_from)
 
 
 @pytest.fixture(scope="module")
-def body():
-    return load_body()
-
-
-@pytest.fixture(scope="module")
 def bank(body):
     return build_bank(list(SEEDS), body, "demo", texture_size=256, pose_count=4)
 

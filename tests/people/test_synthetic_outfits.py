@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.people import outfits, shading, subject
 from humangs_jax.people.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
@@ -16,11 +15,6 @@ from humangs_jax.people.trimmings import EMBLEMS, bitmap, emblem, written
 
 MILLIMETRES = 4e-3
 """The stature is set by two vertices of the mean body; another one may be the highest."""
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.people import cameras, fabrics, rendering, subject, writer
@@ -20,11 +19,6 @@ POKED = 0.01
 UNDER_CLOTH = 0.003
 """Skin this far inside of a hem is meant to be covered, metres."""
 EIGHT_BITS = 0.5 / 255 + 1e-6
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

@@ -30,11 +30,6 @@ def mean_build():
 
 
 @pytest.fixture(scope="module")
-def body():
-    return load_body()
-
-
-@pytest.fixture(scope="module")
 def build():
     return mean_build()
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.motion import Motion, load_motion, save_motion
 from humangs_jax.people import kinematics as kin
@@ -18,11 +17,6 @@ SLIDE = 1.2e-3
 """Metres a frame (3.6 cm/s) that a planted sole may move: as a foot rolls, its round sole touches elsewhere."""
 SUNK = 5e-3
 """Metres that a planted sole may be below the ground; the heel and the toes come up by more."""
-
-
-@pytest.fixture(scope="module")
-def body():
-    return load_body()
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,129 @@
+"""Memory that stays with the process, interrupts that wait, workers that end with it."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from humangs_jax.core.processes import peak_memory, started_deaf, undisturbed
+
+PROGRAM = """
+import resource
+import sys
+import numpy as np
+from humangs_jax.core.processes import keep_freed_memory
+
+kept = keep_freed_memory() if sys.argv[1] == "keep" else False
+faults = []
+for _ in range(6):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    block = np.empty(48 << 20, np.uint8)
+    block[::4096] = 1
+    del block
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(int(kept), faults[-1])
+"""
+
+
+def run(mode):
+    done = subprocess.run([sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True, check=True)
+    return [int(word) for word in done.stdout.split()]
+
+
+def test_freed_blocks_stay_with_the_process():
+    kept, faults = run("keep")
+    if not kept:
+        pytest.skip("this C library has no such setting")
+    assert faults < 10
+    assert run("default")[1] > 10 * max(faults, 1)  # one for each 4 KiB page, or for each huge one
+
+
+def test_the_peak_is_that_of_the_work_inside():
+    """Not of what was freed before, nor of what is kept."""
+    kept = np.ones(16 << 20, np.uint8)
+    for size in (96, 32):
+        with peak_memory() as peak:
+            block = np.ones(size << 20, np.uint8)
+            del block
+        if peak[0] is None:
+            pytest.skip("this system does not tell")
+        assert size - 1 <= peak[0] < size + 24, peak
+    del kept
+
+
+pytestmark = pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signals of POSIX")
+
+
+@pytest.fixture(autouse=True)
+def _default_handler():
+    """Shells start what runs in the background without it."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
+def test_an_interrupt_waits_for_the_end_of_the_block():
+    done = []
+    with pytest.raises(KeyboardInterrupt), undisturbed():
+        signal.raise_signal(signal.SIGINT)
+        done.append("all of it")
+    assert done == ["all of it"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with undisturbed():
+        pass
+    thread = threading.Thread(target=lambda: undisturbed().__enter__())  # only the main thread may set handlers
+    thread.start()
+    thread.join()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_process_that_is_started_deaf_survives_an_interrupt():
+    code = "import os, signal; os.kill(os.getpid(), signal.SIGINT); print('alive')"
+    ends = {}
+    for deaf in (True, False):
+        if deaf:
+            with started_deaf():
+                program = subprocess.Popen(
+                    [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+                )
+        else:
+            program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        ends[deaf] = program.communicate()[0]
+    assert ends == {True: b"alive\n", False: b""}
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+
+
+POOL = """
+import concurrent.futures, multiprocessing, os, time
+from humangs_jax.core.processes import end_with_parent
+if __name__ == "__main__":
+    end_with_parent()  # of no pool: nothing happens
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(2, context, end_with_parent) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        time.sleep(600)
+"""
+
+
+def runs(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_workers_of_a_killed_process_end(tmp_path):
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
+        worker = int(process.stdout.readline())
+        process.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 60
+    while runs(worker):
+        assert time.monotonic() < deadline, "the worker waits for ever"
+        time.sleep(0.02)

@@ -1,0 +1,372 @@
+"""An honest file of each kind: what the hostile ones are made from."""
+
+import functools
+import io
+import json
+import struct
+
+import bvh_files
+import dataset_files
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.fitting.files import KEYS
+from humangs_jax.io.mesh import GlbWriter
+from humangs_jax.network.weights import expected_variables, save_weights
+from humangs_jax.people.seeds import GENERATOR_VERSION
+from humangs_jax.training.config import tiny
+
+K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]
+POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0.9], [0, 0, -1, 2.6], [0, 0, 0, 1]]
+VIEWS = ("000", "001")
+
+
+@functools.cache
+def tiny_body():
+    template = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    return BodyModel(
+        template=template,
+        shape_directions=jnp.ones((4, 3, 3)),
+        pose_directions=None,
+        joint_regressor=jnp.full((5, 4), 0.25),
+        skinning_weights=jnp.full((4, 5), 0.2),
+        faces=jnp.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+        parents=(-1, 0, 1, 2, 3),
+        joint_names=tuple("abcde"),
+        shape_names=tuple("xyz"),
+        name="tiny",
+    )
+
+
+def saved(name, write):
+    """A seed: calls write(path)."""
+
+    def seed(folder):
+        write(folder / name)
+        return folder / name
+
+    return seed
+
+
+def npz(name, arrays):
+    return saved(name, lambda path: np.savez_compressed(path, **arrays()))
+
+
+def written(name, data):
+    """A seed: a file of bytes, of text, or of what a function returns."""
+
+    def make(folder):
+        content = data() if callable(data) else data
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+        return folder / name
+
+    return make
+
+
+def pixels(*shape, dtype=np.uint8):
+    return np.random.default_rng(1).integers(0, 256, shape).astype(dtype)
+
+
+def smplx_arrays(n=9):
+    random = np.random.default_rng(0)
+    weights, regressor = random.uniform(size=(n, 55)), random.uniform(size=(55, n))
+    return {
+        "v_template": random.normal(size=(n, 3)),
+        "f": random.integers(0, n, size=(4, 3)).astype(np.uint32),
+        "shapedirs": random.normal(size=(n, 3, 20)).astype(np.float32),
+        "posedirs": np.zeros((n, 3, 486), np.float32),
+        "J_regressor": regressor / regressor.sum(1, keepdims=True),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "kintree_table": np.stack([np.asarray(PARENTS), np.arange(55)]),
+        **{f"hands_mean{side}": np.zeros(45) for side in "lr"},
+        **{f"hands_components{side}": np.eye(45, dtype=np.float32) for side in "lr"},
+    }
+
+
+def avatar_arrays(g=6, n=4, j=3):
+    random = np.random.default_rng(0)
+    return {
+        "means": random.normal(size=(g, 3)).astype(np.float32),
+        "quats": np.tile(np.float32([1, 0, 0, 0]), (g, 1)),
+        "scales": np.full((g, 3), 0.01, np.float32),
+        "opacities": np.full(g, 0.5, np.float32),
+        "colors": random.random((g, 3)).astype(np.float32),
+        "skinning_weights": np.full((g, j), 1 / j, np.float32),
+        "rest_vertices": random.normal(size=(n, 3)).astype(np.float32),
+        "rest_joints": random.normal(size=(j, 3)).astype(np.float32),
+        "faces": np.int32([[0, 1, 2], [1, 2, 3]]),
+    }
+
+
+AVATAR_HEADER = {
+    **{"format": "humangs-avatar", "version": 1, "parents": [-1, 0, 1], "joint_names": ["a", "b", "c"]},
+    **{"skinning": "affine", "rendering": "exact"},
+}
+
+
+def avatar_file():
+    return {"header": json.dumps(AVATAR_HEADER)} | avatar_arrays()
+
+
+def write_weights(path):
+    config = tiny().model
+    shapes = expected_variables(config)
+    save_weights(path, jax.tree.map(lambda x: np.zeros(x.shape, np.float32), shapes), config, "float16")
+
+
+def capture_description(**changes):
+    views = [
+        {"image": f"images/{name}.png", "mask": f"masks/{name}.png", "frame": i, "K": K, "cam_from_world": POSE}
+        for i, name in enumerate(VIEWS)
+    ]
+    return {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": views} | changes
+
+
+def body_parameters():
+    return {
+        "body": np.asarray("makehuman"),
+        "betas": np.zeros(3, np.float32),
+        "rotations": np.zeros((2, 5, 3), np.float32),
+        "translations": np.zeros((2, 3), np.float32),
+    }
+
+
+def write_capture(folder):
+    for kind, shape in (("images", (12, 10, 3)), ("masks", (12, 10))):
+        (folder / kind).mkdir()
+        for name in VIEWS:
+            Image.fromarray(pixels(*shape)).save(folder / kind / f"{name}.png")
+    (folder / "capture.json").write_text(json.dumps(capture_description()))
+    np.savez_compressed(folder / "body.npz", **body_parameters())
+    return folder
+
+
+def transforms(**changes):
+    frames = [{"file_path": f"photos/{name}.png", "transform_matrix": POSE} for name in VIEWS]
+    return {"fl_x": 60, "cx": 5, "cy": 6, "w": 10, "h": 12, "frames": frames} | changes
+
+
+def opencv_yaml():
+    matrix = lambda name, rows, cols, data: (
+        f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data}\n"
+    )
+    parts = [
+        matrix(f"K_{i}", 3, 3, [60.0, 0, 5, 0, 60, 6, 0, 0, 1])
+        + matrix(f"R_{i}", 3, 3, [1.0, 0, 0, 0, -1, 0, 0, 0, -1])
+        + matrix(f"T_{i}", 3, 1, [0.0, 0.9, 2.6])
+        for i in ("a", "b")
+    ]
+    return "%YAML:1.0\n---\n" + "".join(parts)
+
+
+def write_easymocap(folder):
+    text = opencv_yaml()
+    (folder / "intri.yml").write_text(text)
+    (folder / "extri.yml").write_text(text.replace("R_", "Rot_"))
+    return folder
+
+
+def write_colmap(folder):
+    (folder / "cameras.txt").write_text("# cameras\n1 PINHOLE 10 12 60 60 5 6\n")
+    images = [f"{i} 0 1 0 0 0 0.9 2.6 1 photos/{name}.png\n5.0 6.0 {i}\n" for i, name in enumerate(VIEWS, 1)]
+    (folder / "images.txt").write_text("# images\n" + "".join(images))
+    (folder / "points3D.txt").write_text("# points\n1 0 0.9 0 9 9 9 0.1 1 0\n2 0.1 0.9 0 9 9 9 0.1 2 0\n")
+    return folder
+
+
+def write_import(folder):
+    (folder / "photos").mkdir()
+    for name in VIEWS:
+        Image.fromarray(pixels(12, 10, 3)).save(folder / "photos" / f"{name}.png")
+    (folder / "transforms.json").write_text(json.dumps(transforms()))
+    return folder / "transforms.json"
+
+
+def write_import_folder(folder):
+    write_import(folder)
+    return folder
+
+
+def motion_arrays(**changes):
+    return {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0} | changes
+
+
+def person(count, numbers=3):
+    return np.random.default_rng(2).uniform(10, 400, (count, numbers))
+
+
+def openpose():
+    values = person(25)
+    values[:, 2] = 0.9
+    return json.dumps({"version": 1.3, "people": [{"pose_keypoints_2d": values.ravel().tolist()}]})
+
+
+def coco():
+    values = person(17)
+    values[:, 2] = 0.9
+    entries = [{"file_name": f"{n}.png", "category_id": 1, "keypoints": values.ravel().tolist()} for n in VIEWS]
+    return json.dumps(entries)
+
+
+def coco_annotations():
+    values = person(17)
+    values[:, 2] = 2
+    images = [{"id": i, "file_name": f"{n}.png", "width": 640, "height": 480} for i, n in enumerate(VIEWS)]
+    annotations = [{"id": i, "image_id": i, "keypoints": values.ravel().tolist()} for i in range(len(VIEWS))]
+    return json.dumps({"images": images, "annotations": annotations})
+
+
+def mmpose():
+    frames = [
+        {"frame_id": i, "instances": [{"keypoints": person(17, 2).tolist(), "keypoint_scores": [0.9] * 17}]}
+        for i in range(len(VIEWS))
+    ]
+    return json.dumps({"meta_info": {}, "instance_info": frames})
+
+
+def keypoint_arrays():
+    points = np.stack([person(17, 2)] * 2).astype(np.float32)
+    return {
+        **{"set": np.asarray(COCO_17.name), "names": np.asarray(VIEWS), "points": points},
+        "confidences": np.full((2, 17), 0.9, np.float32),
+    }
+
+
+def fit_arrays():
+    arrays = keypoint_arrays() | {
+        **{"noise": np.ones(2, np.float32), "joint_std": np.ones((2, 5), np.float32)},
+        **{"determined": np.ones((2, 5), np.float32), "shape_covariance": np.eye(3, dtype=np.float32)},
+    }
+    assert set(arrays) == set(KEYS)
+    return arrays
+
+
+def lhm():
+    parts = {"root_pose": (3,), "body_pose": (21, 3), "trans": (3,), "jaw_pose": (3,)}
+    return json.dumps({key: np.zeros(shape).tolist() for key, shape in parts.items()})
+
+
+def write_glb_motion(path):
+    """A skeleton of CMU's names whose hips turn in two frames."""
+    rest, names, writer = shipped_joints(), bvh_files.CMU, GlbWriter()
+    joints = [name for name in JOINT_NAMES if name in names]
+    above = {name: JOINT_NAMES[PARENTS[JOINT_NAMES.index(name)]] for name in joints[1:]}
+    place = lambda name: rest[JOINT_NAMES.index(name)]
+    nodes = [
+        {"name": names[n], "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist()} for n in joints
+    ]
+    for name, node in zip(joints, nodes, strict=True):
+        if children := [joints.index(other) for other in joints if above.get(other) == name]:
+            node["children"] = children
+    matrices = np.tile(np.eye(4), (len(joints), 1, 1))
+    matrices[:, 3, :3] = [-place(name) for name in joints]  # column by column, as glTF has them
+    inverse = writer.array("MAT4", matrices.reshape(-1, 16))
+    times, turns = writer.array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.tile([0.0, 0, 0, 1], (2, 1)))
+    channel = {"sampler": 0, "target": {"node": 0, "path": "rotation"}}
+    animation = {"channels": [channel], "samplers": [{"input": times, "output": turns}]}
+    skin = {"joints": list(range(len(joints))), "inverseBindMatrices": inverse}
+    writer.write(path, {"nodes": nodes, "skins": [skin], "animations": [animation]})
+
+
+def sphere():
+    import trimesh
+
+    return trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+
+
+def mesh(suffix):
+    return written(f"scan.{suffix}", lambda: sphere().export(file_type=suffix))
+
+
+def photo_bytes():
+    stream = io.BytesIO()
+    Image.fromarray(pixels(64, 64, 3)).save(stream, format="PNG")
+    return stream.getvalue()
+
+
+def textured_glb(image=None, images=None, change=lambda content: None):
+    """A GLB of a sphere with one texture in it, or with the JSON changed."""
+    import trimesh
+
+    mesh = sphere()
+    picture = Image.fromarray(pixels(4, 4, 3)) if image is None else image
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2] + 0.5, material=material)
+    data = mesh.export(file_type="glb")
+    length = struct.unpack_from("<I", data, 12)[0]
+    content, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    if images is not None:  # other bytes in place of the texture
+        view = content["bufferViews"][content["images"][0]["bufferView"]]
+        view["byteOffset"], view["byteLength"] = len(binary), len(images)
+        binary += images + bytes(-len(images) % 4)
+        content["buffers"][0]["byteLength"] = len(binary)
+    change(content)
+    header = json.dumps(content).encode()
+    header += b" " * (-len(header) % 4)
+    total = 28 + len(header) + len(binary)
+    chunk = lambda kind, body: struct.pack("<II", len(body), kind) + body
+    return struct.pack("<III", 0x46546C67, 2, total) + chunk(0x4E4F534A, header) + chunk(0x004E4942, binary)
+
+
+def textured_obj(folder, texture="texture.png", material="scan.mtl"):
+    (folder / "scan.mtl").write_text(f"newmtl skin\nKd 1 1 1\nmap_Kd {texture}\n")
+    mesh = sphere()
+    lines = [f"mtllib {material}", "usemtl skin", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
+    lines += [f"vt {x + 0.5} {y + 0.5}" for x, y, _ in mesh.vertices]
+    lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in mesh.faces]
+    (folder / "scan.obj").write_text("\n".join(lines))
+    return folder / "scan.obj"
+
+
+def write_obj(folder):
+    Image.fromarray(pixels(4, 4, 3)).save(folder / "texture.png")
+    return textured_obj(folder)
+
+
+def bank_arrays():
+    p, n, f, q, j, k = 2, 8, 4, 2, 5, 4
+    return {
+        **{"format": np.asarray("humangs-people"), "version": np.asarray(1), "split": np.asarray("train")},
+        **{"generator": np.asarray(1), "parents": np.asarray([-1, 0, 1, 2, 3]), "mirrored_joints": np.arange(j)},
+        **{"seeds": np.asarray([0, 1], np.int32), "betas": np.zeros((p, 3), np.float32)},
+        **{"joints": np.zeros((p, j, 3), np.float32), "vertex_counts": np.full(p, n, np.int32)},
+        **{"vertices": np.zeros((p, n, 3), np.float32), "normals": np.zeros((p, n, 3), np.float16)},
+        **{"joint_ids": np.zeros((p, n, k), np.uint8), "joint_weights": np.full((p, n, k), 0.25, np.float16)},
+        **{"faces": np.zeros((p, f, 3), np.uint16), "uvs": np.zeros((p, f, 3, 2), np.uint16)},
+        **{"face_pieces": np.zeros((p, f), np.uint8), "sheen": np.zeros((p, 32), np.float32)},
+        **{"groups": np.zeros((p, 32), np.uint8), "dyeable": np.zeros((p, 32), np.float32)},
+        **{"texture": np.zeros((p, 8, 8, 6), np.uint8), "rotations": np.zeros((p, q, j, 3), np.float32)},
+        "nearest": np.zeros((p, q), np.int32),
+    }
+
+
+def data_set(write, *arguments, **options):
+    """A seed: the folder of a data set."""
+
+    def seed(folder):
+        write(folder, *arguments, **options)
+        return folder
+
+    return seed
+
+
+def write_dna(folder):
+    import h5py
+
+    return dataset_files.write_dna(folder, h5py, frames=1)
+
+
+STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
+MODEL = dataset_files.model_arrays()
+MANIFEST = {"generator_version": GENERATOR_VERSION} | {
+    "format": "humangs-synthetic",
+    "version": 2,
+    "split": "train",
+    "settings": {},
+}

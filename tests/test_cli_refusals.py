@@ -1,0 +1,203 @@
+"""Command lines that are refused: one line that names file and key, or the option, the exit code, and nothing is written."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+from command_line import save_tiny_avatar
+
+from humangs_jax import cli
+from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.io.images import write_png
+
+
+def spoil_json(change):
+    def spoil(path):
+        file = path / "capture.json"
+        description = json.loads(file.read_text())
+        change(description)
+        file.write_text(json.dumps(description))
+
+    return spoil
+
+
+def spoil_body(change):
+    def spoil(path):
+        arrays = dict(np.load(path / "body.npz"))
+        change(arrays)
+        np.savez(path / "body.npz", **arrays)
+
+    return spoil
+
+
+BAD_CAPTURES = {
+    "missing image": (lambda path: next((path / "images").iterdir()).unlink(), "images/"),
+    "wrong K shape": (spoil_json(lambda d: d["views"][0].update(K=[[1, 0], [0, 1]])), "views[0].K"),
+    "NaN pose": (spoil_body(lambda a: a["rotations"].__setitem__((0, 0, 0), np.nan)), "rotations"),
+    "mismatched counts": (spoil_body(lambda a: a.update(translations=np.zeros((7, 3)))), "translations"),
+    "frame out of range": (spoil_json(lambda d: d["views"][1].update(frame=5)), "views[1].frame"),
+    "singular camera": (
+        spoil_json(lambda d: d["views"][0].update(cam_from_world=[[0, 0, 0, 0]] * 3 + [[0, 0, 0, 1]])),
+        "cam_from_world",
+    ),
+    "0 views": (spoil_json(lambda d: d.update(views=[])), "views"),
+}
+
+
+def spoiled(folder, path, spoil):
+    shutil.copytree(folder, path)
+    spoil(path)
+    return path
+
+
+@pytest.mark.parametrize("case", BAD_CAPTURES)
+@pytest.mark.parametrize("command", ["reconstruct", "check"])
+def test_a_bad_capture_is_one_line_and_nothing_is_written(case, command, capture_folder, tmp_path, humangs):
+    spoil, field = BAD_CAPTURES[case]
+    bad, out = spoiled(capture_folder, tmp_path / "bad", spoil), tmp_path / "out"
+    out.mkdir()
+    code, printed, error = humangs(command, bad, "--out", out / {"check": "result.png"}.get(command, "result.npz"))
+    assert code == cli.BAD_DATA and printed == ""
+    assert error.count("\n") == 1 and error.startswith("humangs: error: ")
+    assert field in error and "bad" in error  # names the field and the file
+    assert list(out.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def things(tmp_path_factory, capture_folder):
+    """A folder of files that are not what they are taken for, and of a few that are."""
+    path = tmp_path_factory.mktemp("things")
+    shutil.copytree(capture_folder, path / "someone")
+    save_capture(path / "bare", dataclasses.replace(load_capture(capture_folder), masks=None))
+    save_tiny_avatar(path / "me.npz")
+    data = (path / "me.npz").read_bytes()
+    (path / "truncated.npz").write_bytes(data[: len(data) // 2])
+    middle = data.index(b"quats.npy") + 100
+    (path / "altered.npz").write_bytes(data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :])
+    arrays = dict(np.load(path / "me.npz"))
+    header = json.loads(str(arrays["header"]))
+    write = lambda name, **changes: np.savez(path / name, **{**arrays, **changes})
+    write("other_numbers.npz", colors=np.full((3, 3), 0.25, np.float32))
+    del header["checksum"]
+    write("nan.npz", header=json.dumps(header), means=np.full((3, 3), np.nan, np.float32))
+    np.savez(path / "no_keys.npz", header=arrays["header"])
+    write_png(path / "photo.png", np.ones((8, 8, 3)))
+    (path / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    np.savez(path / "ten.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), mocap_framerate=30)
+    np.savez(path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30)
+    np.savez(path / "pickled.npz", poses=np.array([{"a": 1}], dtype=object), trans=np.zeros((1, 3)))
+    (path / "folder.npz").mkdir()
+    (path / "file").write_text("mine")
+    (path / "file.npz").write_text("mine")
+    np.savez(path / "body.npz", body="makehuman")
+    return path
+
+
+FIT = "fit someone --keypoints k.json"
+BAD_DATA = {
+    "export truncated.npz": "truncated.npz: not an avatar file",
+    "export altered.npz": "altered.npz: not an avatar file",
+    "export other_numbers.npz": "other_numbers.npz",
+    "export nan.npz": "nan.npz: means: expected",
+    "export no_keys.npz": "no_keys.npz: missing keys",
+    "export photo.png": "photo.png: not an avatar file",
+    "export someone/body.npz --out a.ply": "body.npz",
+    "animate cloud.ply": "cloud.ply: not an avatar file",
+    "animate nobody.npz --out a.mp4": "nobody.npz",
+    "animate me.npz --motion ten.npz": "ten.npz: poses: expected",
+    "animate me.npz --motion pickled.npz": "pickled.npz: no motion: expected one of the keys",
+    "animate me.npz --motion far.npz": "far.npz",
+    "reconstruct photo.png": "photo.png",
+    "reconstruct cloud.ply": "cloud.ply",
+    "reconstruct me.npz": "me.npz",
+    "reconstruct nowhere --out a.npz": "nowhere",
+    "reconstruct someone --weights someone/body.npz --no-check --out a.npz": "body.npz",
+    "check photo.png": "photo.png",
+    "convert nobody.pt": "nobody.pt: no such file",
+    "convert photo.png": "photo.png",
+    "start cloud.ply --out new": "cloud.ply: is a file: expected a folder of photos",
+    "fit photo.png --keypoints k.json": "photo.png",
+    f"{FIT} --out new": "k.json",
+    "fit --scan scan.obj --out new": "scan.obj",
+    "fit --scan scan.obj --views v": "scan.obj",
+    "import cameras none --images someone/images --out new": "none",
+}
+SIZES = {"animate me.npz": "", "render me.npz": "", "demo": " 16 to 8192", "synth": " 128, 256 or 512"}
+BAD_USAGE = {
+    **{
+        f"{line} --size {n}": f"--size {n}: expected{words}"
+        for line, words in SIZES.items()
+        for n in ("-5", "0", "100000")
+    },
+    "synth --size 100": "--size 100: expected 128, 256 or 512",
+    "refine me.npz me --image-size 0": "--image-size 0: expected 16 to 8192",
+    "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
+    "refine me.npz someone --out me.npz": "--out me.npz: is read by this command",
+    "animate me.npz --azimuth nan": "--azimuth nan: expected a number from",
+    "animate nobody.npz --out a.txt": "--out a.txt: expected a name ending in",
+    "demo --refine inf": "--refine inf: expected at least 0",
+    "synth --workers 0": "--workers 0: expected at least 1",
+    "synth --subjects 0 --out people": "--subjects 0: expected at least 1",
+    "synth --for-training --views 7": "--views 7: does not go with --for-training, which means 12",
+    "start me --out new --masks m --without-masks": "--masks m: does not go with --without-masks",
+    "train --on-the-fly -1": "--on-the-fly -1: expected at least 0",
+    "train --on-the-fly 1 --steps 0": "--steps 0: expected at least 1",
+    "train": "nobody to train on",
+    "reconstruct someone --refine soon --out a.npz": "--refine 'soon': expected how long",
+    "reconstruct bare --no-check --refine 15s --out a.npz": "--refine 15s: needs masks",
+    "reconstruct someone --out no/such/folder.npz": "--out no/such/folder.npz: the folder no/such does not exist",
+    "reconstruct x --out folder.npz": "--out folder.npz: is a folder: expected the name of a file",
+    "reconstruct x --out file.npz/a.npz": "--out file.npz/a.npz: the folder file.npz is no folder",
+    "reconstruct x --out a.zip": "--out a.zip: expected a name ending in .npz",
+    "reconstruct x --out body.npz": "--out body.npz: exists and is no avatar",
+    "reconstruct x --out /proc/a.npz": "--out /proc/a.npz: cannot write to /proc",
+    **{
+        f"{line} --out file": "--out file: is a file"
+        for line in (
+            *("demo", "synth", "train --on-the-fly 1", "import cameras c --images i", "fit capture --keypoints k"),
+            *("fit --scan s.obj", "start photos", "render me.npz"),
+        )
+    },
+    "fit --scan s.obj --views file": "--views file: is a file",
+    "fit": "give either a CAPTURE folder or --scan MESH",
+    "fit someone --scan scan.obj": "give either a CAPTURE folder or --scan MESH",
+    "fit someone": "body.npz exists: --overwrite replaces it",
+    FIT: "body.npz exists: --overwrite replaces it",
+    "fit someone --bare": "--bare is for --scan or --refine, not for --keypoints",
+    "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
+    f"{FIT} --smoothness -1 --out new": "--smoothness -1.0: expected at least 0",
+    "fit --scan scan.obj --refine": "--refine is for captures, not for --scan",
+    "fit --scan scan.obj": "--out FOLDER is missing",
+    "fit --scan scan.obj --keypoints k.json --out new": "needs --views FOLDER",
+    "fit --scan scan.obj --joints j.json --views v": "--joints and --views: give one",
+}
+REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]
+REFUSED += [(line, cli.BAD_USAGE, said) for line, said in BAD_USAGE.items()]
+
+
+def contents(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(("line", "expected", "said"), REFUSED, ids=[line for line, *_ in REFUSED])
+def test_what_cannot_be_meant_is_one_line_before_the_work(line, expected, said, things, monkeypatch, humangs):
+    """Bad usage ends with 2, bad data with 1."""
+    monkeypatch.chdir(things)
+    before = contents(things)
+    code, out, err = humangs(*line.split())
+    assert err.count("\n") == 1 and err.startswith("humangs: error: ") and said in err and out == "", (out, err)
+    assert code == expected and (expected == cli.BAD_DATA or said[:2] != "--" or f"error: {said}" in err)
+    assert contents(things) == before
+
+
+def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, humangs):
+    """The quick part of `check`; without weights that can be read the command ends before the work."""
+    in_degrees = spoil_body(lambda arrays: arrays.update(rotations=np.degrees(arrays["rotations"])))
+    turned = spoiled(capture_folder, tmp_path / "turned", in_degrees)
+    arguments = ("reconstruct", turned, "--weights", tmp_path / "none", "--out", tmp_path / "a.npz")
+    code, _, err = humangs(*arguments)
+    assert code == cli.BAD_DATA and "warning: the poses seem to be in degrees" in err and "humangs check" in err
+    _, _, err = humangs(*arguments, "--no-check")
+    assert "warning" not in err
