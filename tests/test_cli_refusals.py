@@ -124,7 +124,7 @@ BAD_DATA = {
     "fit --scan scan.obj --views v": "scan.obj",
     "import cameras none --images someone/images --out new": "none",
 }
-SIZES = {"animate me.npz": "", "render me.npz": "", "demo": " 16 to 8192", "synth": " 128, 256 or 512"}
+SIZES = {"animate me.npz": "", "render me.npz": "", "demo": " 16 to 8,192", "synth": " 128, 256 or 512"}
 BAD_USAGE = {
     **{
         f"{line} --size {n}": f"--size {n}: expected{words}"
@@ -132,10 +132,10 @@ BAD_USAGE = {
         for n in ("-5", "0", "100000")
     },
     "synth --size 100": "--size 100: expected 128, 256 or 512",
-    "refine me.npz me --image-size 0": "--image-size 0: expected 16 to 8192",
+    "refine me.npz me --image-size 0": "--image-size 0: expected 16 to 8,192",
     "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
     "refine me.npz someone --out me.npz": "--out me.npz: is read by this command",
-    "animate me.npz --azimuth nan": "--azimuth nan: expected a number from",
+    "animate me.npz --azimuth nan": "--azimuth nan: expected -36,000 to 36,000",
     "animate nobody.npz --out a.txt": "--out a.txt: expected a name ending in",
     "demo --refine inf": "--refine inf: expected at least 0",
     "synth --workers 0": "--workers 0: expected at least 1",
@@ -167,7 +167,7 @@ BAD_USAGE = {
     FIT: "body.npz exists: --overwrite replaces it",
     "fit someone --bare": "--bare is for --scan or --refine, not for --keypoints",
     "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
-    f"{FIT} --smoothness -1 --out new": "--smoothness -1.0: expected at least 0",
+    f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
     "fit --scan scan.obj --refine": "--refine is for captures, not for --scan",
     "fit --scan scan.obj": "--out FOLDER is missing",
     "fit --scan scan.obj --keypoints k.json --out new": "needs --views FOLDER",

@@ -24,6 +24,7 @@ from humangs_jax.avatar.sheets import contact_sheet, tile
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -88,13 +89,12 @@ class CheckReport:
 
     def __str__(self) -> str:
         """A table, then the warnings."""
-        width = max(4, *(len(view.name) for view in self.views))
-        lines = [f"{'view':<{width}}  silhouette IoU  body outside mask  body in frame"]
+        rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
             outside = "" if view.outside is None else f"{view.outside:.1%}"
-            mark = "  !" if view.warnings else ""
-            lines.append(f"{view.name:<{width}}  {iou:>14}  {outside:>17}  {view.inside:>12.0%}{mark}")
+            rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warnings))])
+        lines = text_table(rows)
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
@@ -352,18 +352,17 @@ def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
 def limits_table(capture: Capture) -> str:
     """A line a quantity: the range, what this capture has, and a mark where that lies outside."""
     limits, own = load_limits(), quantities(capture)
-    lines = [f"ranges in which avatars lose less than {limits['bound']:g} dB, each alone (docs/stability.md):"]
-    width = max(len(name) for name in limits["ranges"])
+    title = f"ranges in which avatars lose less than {limits['bound']:g} dB, each alone (docs/stability.md):"
+    rows = []
     for name, row in limits["ranges"].items():
         low, high = row["low"], row["high"]
-        wanted = _range(low, high, row["unit"])
-        has = ""
+        has = []
         if name in own:
             least, most = own[name]
             outside = (low is not None and least < low) or (high is not None and most > high)
-            has = f"here {_range(least, most, row['unit'])}{'  !' * outside}"
-        lines.append(f"{name:<{width}}  {wanted:<27}{has}".rstrip())
-    return "\n".join(lines)
+            has = [f"here {_range(least, most, row['unit'])}", *("!" * outside)]
+        rows.append([name, _range(low, high, row["unit"]), *has])
+    return "\n".join([title, *text_table(rows, left=4)])
 
 
 def _range(low: float | int | None, high: float | int | None, unit: str) -> str:

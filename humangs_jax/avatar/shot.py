@@ -6,9 +6,9 @@ nothing heavy. `avatar.frames` draws by it.
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
-from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.configuration import ArgumentError, Range, check_range
 
 LARGEST_SIDE = 8192
 """Pixels: the largest level of H.264 and VP9."""
@@ -18,21 +18,21 @@ LARGEST_SIDE = 8192
 class Shot:
     """The images: their size, what is behind the person, where the camera stands."""
 
-    size: int = 512
+    size: Annotated[int, Range(1, LARGEST_SIDE)] = 512
     """Side of the images in pixels; --width and --height give other shapes."""
-    width: int | None = None
+    width: Annotated[int | None, Range(1, LARGEST_SIDE)] = None
     """Width of the images in pixels."""
-    height: int | None = None
+    height: Annotated[int | None, Range(1, LARGEST_SIDE)] = None
     """Height of the images in pixels."""
     background: str = "white"
     """A color (a CSS name or #rrggbb), or transparent."""
-    azimuth: float = 0.0
+    azimuth: Annotated[float, Range(-36000, 36000)] = 0.0
     """Degrees around the person; 0 looks at the front, 90 at the left side."""
-    elevation: float = 6.0
+    elevation: Annotated[float, Range(-89, 89)] = 6.0
     """Degrees of the camera above the horizon."""
-    distance: float | None = None
+    distance: Annotated[float | None, Range(0.01, 1000)] = None
     """Metres from the person. Default: as near as all that is shown of the person fits."""
-    fov: float = 30.0
+    fov: Annotated[float, Range(1, 150)] = 30.0
     """Vertical field of view, degrees."""
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"
     """How Gaussians are drawn: near_exact and fast trade accuracy for time (docs/performance.md), inria is the published
@@ -43,15 +43,8 @@ class Shot:
 
     def check(self) -> None:
         """Raises: ValueError naming what is out of range."""  # not on construction: the command line would make a box of it
-        for name in ("size", "width", "height"):
-            value = getattr(self, name)
-            if value is not None and not 1 <= value <= LARGEST_SIDE:
-                raise ArgumentError(name, f"{value}: expected 1 to {LARGEST_SIDE} pixels")
-        ranges = {"azimuth": (-36000, 36000), "elevation": (-89, 89), "fov": (1, 150), "distance": (0.01, 1000)}
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise ArgumentError(name, f"{value}: expected a number from {low} to {high}")
+        for field in dataclasses.fields(self):
+            check_range(Shot, field.name, getattr(self, field.name), field.name)
         self.color()
 
     @property

@@ -72,6 +72,8 @@ def main() -> None:
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help and what tyro refuses."""
     from humangs_jax.cli import screen
+    from humangs_jax.cli.options import check_options
+    from humangs_jax.core import progress
 
     screen.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
@@ -82,7 +84,8 @@ def execute(arguments: Sequence[str]) -> int:
             screen.tell(f"humangs_jax {__version__}")
         else:
             command = _parsed(arguments)
-            screen.begin("--quiet" in given, verbose)
+            check_options(command)
+            progress.begin(quiet="--quiet" in given, lines=verbose)
             command.run()
             screen.finish()
         sys.stdout.flush()
@@ -103,7 +106,7 @@ def execute(arguments: Sequence[str]) -> int:
             return _failed(MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose)
         raise
     finally:
-        screen.end()
+        progress.end()
 
 
 def _prepare(verbose: bool) -> None:

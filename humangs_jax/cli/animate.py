@@ -1,7 +1,6 @@
 """`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,24 +8,17 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import VIDEOS
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.cli.options import (
-    Preset,
-    UsageError,
-    chosen_settings,
-    require_at_least,
-    require_between,
-    require_folder,
-    require_parent,
-    require_suffix,
-)
+from humangs_jax.cli.options import Place, Preset, UsageError, chosen_settings
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
 from humangs_jax.data.formats import MOTIONS
 
 TURN_SECONDS = 4.0
 """A turntable as a video turns once in this time."""
-SLOWEST, FASTEST = 0.01, 1000.0
-"""Frames per second."""
+RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
+"""Of frames per second, and of any number."""
+VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)
 
@@ -39,12 +31,12 @@ class Animate:
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
     motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = None
-    out: Annotated[Path, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
-    turn: float = 0.0
+    out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
+    turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
     follow: bool = True
     """The camera goes along with the person; --no-follow: it stands still, and sees everywhere that the person goes."""
-    fps: float | None = None
+    fps: Annotated[float | None, RATE] = None
     """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
     start: float = 0.0
     """Where to begin, in seconds of the motion."""
@@ -58,10 +50,6 @@ class Animate:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
-        self.shot.check()
-        require_between(-math.inf, math.inf, turn=self.turn)
-        require_between(SLOWEST, FASTEST, fps=self.fps)
-        _require_place(self.out)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.frames import excerpt, images, motion_views
@@ -94,14 +82,14 @@ class Render:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot]
-    out: Annotated[Path, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = Path(
-        "views"
+    out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = (
+        Path("views")
     )
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
-    views: int | None = None
+    views: Annotated[int | None, at_least(1)] = None
     """Number of cameras on the circle. Default: 8; for a video as many as one turn in 4 seconds takes."""
-    fps: float = 24.0
+    fps: Annotated[float, RATE] = 24.0
     """Frames per second of a video."""
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead of a circle."""
@@ -117,13 +105,9 @@ class Render:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
-        self.shot.check()
-        require_between(SLOWEST, FASTEST, fps=self.fps)
         video, views = self.out.suffix != "", self.views
         if views is None:
             views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
-        require_at_least(1, views=views)
-        _require_place(self.out)
         if video and self.exr:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         if self.capture is not None:
@@ -183,7 +167,7 @@ class View:
     --live` does so), or the folder of a training run, whose newest weights reconstruct someone."""
     motion: Path | None = None
     """The motion it plays. Default: the shipped walk."""
-    port: int = 0
+    port: Annotated[int, Range(0, 65535)] = 0
     """Port on 127.0.0.1; 0 for any free one."""
     browser: bool = True
     """Open the browser; --no-browser only prints the address."""
@@ -193,7 +177,6 @@ class View:
     """--live of a training run: the capture of the person that it reconstructs. Default: the shipped one."""
 
     def run(self) -> None:
-        require_between(0, 65535, port=self.port)
         if self.capture is not None and not self.live:
             raise UsageError("--capture: only with --live")
         with stage("starting"):
@@ -214,15 +197,6 @@ class View:
             name = None if self.motion is None else self.motion.stem
             text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
-
-
-def _require_place(out):
-    """A video, or a folder of PNG files. Raises: UsageError."""
-    if out.suffix:
-        require_suffix(out, VIDEOS.suffixes)
-        require_parent(out)
-    else:
-        require_folder(out)
 
 
 def _drawn_by(shot, preset, config):

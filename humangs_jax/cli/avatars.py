@@ -8,20 +8,18 @@ from tyro.conf import Positional, arg
 
 from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
 from humangs_jax.cli.options import (
-    LARGEST_IMAGE,
+    AVATAR,
+    Place,
     Preset,
+    Side,
     UsageError,
     chosen_settings,
     first_refinement,
     refine_limits,
-    require_at_least,
-    require_avatar,
-    require_between,
-    require_folder,
-    require_parent,
-    require_suffix,
+    require_file,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.core.registry import alternatives
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
@@ -43,21 +41,18 @@ _USUAL_UP = (
 class Demo:
     """Reconstruct the person that comes with the package from four photos, render new views, animate the avatar."""
 
-    out: Path = Path("demo_out")
+    out: Annotated[Path, Place()] = Path("demo_out")
     """Folder for the images, the video, the avatar and report.json."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
-    size: int = 256
+    size: Side = 256
     """Side of the animation's frames in pixels."""
-    refine: float | None = None
+    refine: Annotated[float | None, at_least(0)] = None
     """Seconds for which the avatar is fitted to its photos; 0 for none. Default: 15, or as long as --preset says."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network, drawing, and refinement where --refine does not say."""
 
     def run(self) -> None:
-        require_at_least(0, refine=self.refine)
-        require_between(16, LARGEST_IMAGE, size=self.size)
-        require_folder(self.out)
         with stage("starting"):
             from humangs_jax.apps.demo import run_demo, summary
             from humangs_jax.refinement.config import RefineConfig
@@ -78,9 +73,9 @@ class Reconstruct:
 
     capture: Positional[Path]
     """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
-    out: Path = Path("avatar.npz")
+    out: Annotated[Path, AVATAR] = Path("avatar.npz")
     """The avatar file to write; an avatar that is there is replaced."""
-    views: int | Literal["auto"] | None = None
+    views: Annotated[int | Literal["auto"] | None, at_least(1)] = None
     """Use this number of photos: those that together show most of the body; auto: those that add something. Default: all."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
@@ -104,8 +99,6 @@ class Reconstruct:
 
     def run(self) -> None:
         limits = first_refinement(self.refine)
-        require_at_least(1, views=None if self.views == "auto" else self.views)
-        require_avatar(self.out)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.views import select_views
@@ -152,13 +145,13 @@ class Refine:
     """File written by `humangs reconstruct` from these photos."""
     capture: Positional[Path]
     """Folder with capture.json: may have more or larger photos than the network saw."""
-    out: Path = Path("refined.npz")
+    out: Annotated[Path, AVATAR] = Path("refined.npz")
     """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
     """How long: seconds ("15s"), steps ("100steps") or iterations alone ("0steps"), after a compilation of some seconds."""
-    iterations: int = ITERATIONS
+    iterations: Annotated[int, Range(0, 16)] = ITERATIONS
     """Rounds of the learned update before the steps; 0: steps alone."""
-    image_size: int | None = None
+    image_size: Side | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
     """Also refine the pose of each photo. On bodies that are millimetres off it gained nothing (docs/refinement.md)."""
@@ -171,9 +164,8 @@ class Refine:
 
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")
-        require_between(16, LARGEST_IMAGE, image_size=self.image_size)
-        require_between(0 if limits["steps"] != 0 else 1, 16, iterations=self.iterations)
-        require_avatar(self.out, inputs=(self.avatar,))
+        if limits["steps"] == 0 and not self.iterations:
+            raise UsageError("--iterations 0: expected 1 to 16, without steps")
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.refinement.config import RefineConfig
@@ -245,7 +237,7 @@ class Export:
     out: Annotated[
         Path | None, arg(help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it.")
     ] = None
-    html: Path | None = None
+    html: Annotated[Path | None, Place((".html",))] = None
     """The page to write: one .html file that needs no network (docs/viewer.md)."""
     mesh: bool = False
     """--out: the body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
@@ -264,10 +256,8 @@ class Export:
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
         suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
-        for option, path, allowed in (("--out", out, suffixes), ("--html", self.html, (".html",))):
-            if path is not None:
-                require_parent(path, option)
-                require_suffix(path, allowed, option)
+        if out is not None:
+            require_file(out, suffixes, read=(self.avatar, self.motion))
         self._check(out)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
@@ -352,7 +342,7 @@ class Tune:
 
     capture: Positional[Path]
     """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
-    out: Path = Path("tuned.json")
+    out: Annotated[Path, Place((".json",))] = Path("tuned.json")
     """The settings to write, for --config of `reconstruct`, `animate`, `render`; beside them an image, of the same name."""
     reconstruct_ms: float | None = None
     """The most that making the avatar may take, with refinement, milliseconds."""
@@ -360,7 +350,7 @@ class Tune:
     """The most that a frame may take, milliseconds; 33 is 30 frames per second."""
     memory_mb: float | None = None
     """The most memory that this may add to the process, MiB."""
-    size: int = 512
+    size: Side = 512
     """Side of the frames in pixels."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
@@ -372,10 +362,7 @@ class Tune:
         for name, value in budgets.items():
             if value is not None and not value > 0:
                 raise UsageError(f"--{name.replace('_', '-')} {value}: expected a positive number")
-        require_between(16, LARGEST_IMAGE, size=self.size)
-        require_suffix(self.out, (".json",))
-        for path in (self.out, self.out.with_suffix(".png")):
-            require_parent(path, inputs=(self.weights,))
+        require_file(self.out.with_suffix(".png"), (".png",))
         with stage("starting"):
             from humangs_jax.apps.settings import Budget, both_avatars, in_words, load_front, tune, usable, write_tuned
             from humangs_jax.network.weights import load_weights

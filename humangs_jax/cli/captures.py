@@ -1,14 +1,14 @@
 """`humangs import` and `humangs synth`: capture folders from calibrated photos, and of synthetic people."""
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_replaceable, tell_deleted
+from humangs_jax.cli.options import Place, UsageError, Workers, cores, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import CAMERAS
 
 if TYPE_CHECKING:
@@ -59,14 +59,12 @@ class Detect:
 
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
-    out: Path
+    out: Annotated[Path, Place()]
     """Folder for keypoints.json, masks/, people.png (the sheet) and people.json (everybody)."""
-    person: int | None = None
+    person: Annotated[int | None, at_least(0)] = None
     """Which person, by the number on the sheet, where several are of nearly one size."""
 
     def run(self) -> None:
-        require_at_least(0, person=self.person)
-        require_folder(self.out)
         with stage("starting"):
             from humangs_jax.apps import detect
 
@@ -138,7 +136,7 @@ FOR_TRAINING = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
 class Extras:
     """Besides the photos."""
 
-    held_out: int = 0
+    held_out: Annotated[int, at_least(0)] = 0
     """Views of the first pose from other cameras, in the sub-folder held_out/."""
     scans: bool = False
     """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
@@ -149,41 +147,37 @@ class Synth:
     """Make synthetic clothed people and write them as capture folders. Can be interrupted and resumed, or added to."""
 
     extras: OmitArgPrefixes[Extras]
-    out: Path = Path("synthetic_people")
+    out: Annotated[Path, Place()] = Path("synthetic_people")
     """Folder for one capture folder per subject and manifest.json."""
-    subjects: int = 8
+    subjects: Annotated[int, at_least(1)] = 8
     """Number of people."""
     split: Literal["train", "validation", "test", "demo"] = "train"
     """The seeds of the splits never overlap."""
-    first: int = 0
+    first: Annotated[int, at_least(0)] = 0
     """Number of the first subject within the split."""
     size: int = 512
     """Side of the photos in pixels: 128, 256, 512 (a set of 512 can be read at all three)."""
-    views: int = 60
+    views: Annotated[int, at_least(1)] = 60
     """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away."""
-    close_views: int = 12
+    close_views: Annotated[int, at_least(0)] = 12
     """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person."""
-    poses: int = 1
+    poses: Annotated[int, at_least(1)] = 1
     """Poses per subject."""
     sequences: bool = False
     """The poses are frames of a walk, a turn or a reach, which is written as motion.npz."""
-    frames: int = 60
+    frames: Annotated[int, at_least(1)] = 60
     """Length of that motion, 30 frames per second."""
     for_training: bool = False
     """Short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`."""
-    workers: int | None = None
+    workers: Workers = None
     """Processes. Default: as many as cores."""
 
     def run(self) -> None:
         extras = self.extras
-        counts = {name: getattr(self, name) for name in ("subjects", "views", "poses", "frames")}
-        require_at_least(1, workers=self.workers, **counts)
-        require_at_least(0, first=self.first, close_views=self.close_views, held_out=extras.held_out)
         if self.size not in SIZES:
             raise UsageError(f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}")
         if self.sequences and self.poses > self.frames:
             raise UsageError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
-        require_folder(self.out)
         small = FOR_TRAINING if self.for_training else {}
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, value in small.items():
@@ -204,12 +198,7 @@ class Synth:
             frames=self.frames if self.sequences else 0,
             scan_texture=2048 if extras.scans else 0,
         )
-        workers = _cores() if self.workers is None else self.workers
         with stage("making people"):
-            folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=workers)
+            folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=cores(self.workers))
         wrote(self.out, f"{len(folders)} people")
         suggest("humangs train", self.out, "--out runs/train")
-
-
-def _cores():
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -2,12 +2,13 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import UsageError, require_at_least, require_parent, require_suffix
+from humangs_jax.cli.options import Place, UsageError
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.core.configuration import at_least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,33 +44,25 @@ class Evaluate:
     """Whose backgrounds, crops, networks and SSIM."""
     body: Path | None = None
     """Model file that the parameters of a data set belong to. Default: the body that comes with the package."""
-    inputs: int | None = None
+    inputs: Annotated[int | None, at_least(1)] = None
     """How many photos are inputs, evenly spaced. Default: 4."""
     indices: Path | None = None
     """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target": [...]}}."""
-    json: Path | None = None
+    json: Annotated[Path | None, Place((".json",))] = None
     """Write all numbers here."""
-    html: Path | None = None
+    html: Annotated[Path | None, Place((".html",))] = None
     """Write a page with inputs, truth, ours and error, worst first."""
-    csv: Path | None = None
+    csv: Annotated[Path | None, Place((".csv",))] = None
     """Write one line an image."""
-    markdown: Path | None = None
+    markdown: Annotated[Path | None, Place((".md",))] = None
     """Write a table of people."""
-    latex: Path | None = None
+    latex: Annotated[Path | None, Place((".tex",))] = None
     """Write the same table for LaTeX (package booktabs)."""
-    page_images: int = 120
+    page_images: Annotated[int, at_least(0)] = 120
     """Images that the page shows."""
 
     def run(self) -> None:
-        require_at_least(0, page_images=self.page_images)
-        if self.inputs is not None:
-            require_at_least(1, inputs=self.inputs)
-        files = {"json": self.json, "html": self.html, "csv": self.csv, "markdown": self.markdown, "latex": self.latex}
-        suffixes = {"json": ".json", "html": ".html", "csv": ".csv", "markdown": ".md", "latex": ".tex"}
-        for name, path in files.items():
-            if path is not None:
-                require_parent(path, f"--{name}")
-                require_suffix(path, (suffixes[name],), f"--{name}")
+        files = {name: getattr(self, name) for name in ("json", "html", "csv", "markdown", "latex")}
         with stage("starting"):
             from humangs_jax.evaluation.run import evaluate
             from humangs_jax.losses.loss_networks import load_lpips

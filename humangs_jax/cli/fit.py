@@ -10,16 +10,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.captures import found_here, tell_found
-from humangs_jax.cli.options import (
-    UsageError,
-    require_at_least,
-    require_folder,
-    require_parent,
-    require_replaceable,
-    require_suffix,
-    tell_deleted,
-)
+from humangs_jax.cli.options import Place, UsageError, require_file, require_folder, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import KEYPOINTS
 
 
@@ -95,7 +88,7 @@ class Fit:
     """Folder with capture.json; its body.npz need not exist."""
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
-    smoothness: float = 0.0
+    smoothness: Annotated[float, at_least(0)] = 0.0
     """Typical acceleration of joints in metres per frame squared, for sequences (walking at 24 frames a second: 0.02). 0:
     frames are fitted one by one."""
     out: Path | None = None
@@ -145,7 +138,6 @@ class Fit:
 
     def _fit_keypoints(self):
         assert self.capture is not None  # `run` has checked it
-        require_at_least(0, smoothness=self.smoothness)
         with stage("starting"):
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
@@ -267,16 +259,14 @@ class Check:
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
-    out: Path = Path("check.png")
+    out: Annotated[Path, Place((".png",))] = Path("check.png")
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
     limits: bool = False
     """Also print the ranges in which avatars stay good, and where this capture lies in them (docs/stability.md)."""
 
     def run(self) -> None:
         sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
-        for path in (self.out, sheet):
-            require_suffix(path, (".png",))
-            require_parent(path)
+        require_file(sheet, (".png",))
         with stage("starting"):
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture

@@ -5,16 +5,17 @@ file that exists is replaced, whole, once the work is done; an .npz by its own k
 folder of a capture or of a fit to a scan is replaced with --overwrite only; `demo`, `render`, `synth`, `train` add to theirs.
 """
 
-import math
+import dataclasses
+import os
 import re
 import tempfile
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
+from humangs_jax.core.configuration import Range, at_least, check_range, marks_in
 from humangs_jax.core.progress import say
-from humangs_jax.core.registry import alternatives
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
@@ -23,6 +24,8 @@ LARGEST_IMAGE = 8192
 """Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn."""
 
 
+Side = Annotated[int, Range(16, LARGEST_IMAGE)]
+Workers = Annotated[int | None, at_least(1)]
 Preset = Literal["realtime", "balanced", "quality", "best"]
 """Names of `humangs_jax.PRESETS`."""
 
@@ -36,8 +39,61 @@ def option_of(argument: str) -> str:
     return "--out" if argument == "path" else f"--{argument.replace('_', '-')}"
 
 
-def require_parent(path: Path, option: str = "--out", inputs: Iterable[Path | None] = ()) -> None:
-    """A file can be written to that path. inputs: files that the command reads (None is left out). Raises: UsageError."""
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Annotation of an option that says where results go. Without suffixes it is a folder, which is made if it does not exist.
+
+    suffixes: of a file. folder: a name without suffix is a folder. avatar: the file replaces an avatar only.
+    """
+
+    suffixes: tuple[str, ...] = ()
+    folder: bool = False
+    avatar: bool = False
+
+
+AVATAR = Place((".npz",), avatar=True)
+
+
+def check_options(command: Any) -> None:
+    """Before the work: are options in the ranges of their annotations, can their places be written to? Raises: UsageError."""
+    cls = type(command)
+    hints = {name: hint for name, hint in get_type_hints(cls, include_extras=True).items() if hasattr(command, name)}
+    places = {name: place for name, hint in hints.items() for place in marks_in(hint, Place)}
+    read = [getattr(command, name) for name in hints if name not in places]
+    for name in hints:
+        if dataclasses.is_dataclass(value := getattr(command, name)):
+            check_options(value)
+            continue
+        try:
+            check_range(cls, name, value, option_of(name))
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    for name, place in places.items():
+        if (path := getattr(command, name)) is not None:
+            _require_place(path, option_of(name), place, [each for each in read if isinstance(each, Path)])
+
+
+def _require_place(path: Path, option: str, place: Place, read: Iterable[Path]) -> None:
+    if not place.suffixes or (place.folder and not path.suffix):
+        require_folder(path, option)
+        return
+    require_file(path, place.suffixes, option, read)
+    if place.avatar and path.exists():
+        try:
+            with zipfile.ZipFile(path) as archive:
+                mine = {"header.npy", "skinning_weights.npy"} <= set(archive.namelist())
+        except (zipfile.BadZipFile, OSError):
+            mine = False
+        if not mine:
+            raise UsageError(f"{option} {path}: exists and is no avatar: expected another name")
+
+
+def require_file(
+    path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()
+) -> None:
+    """A file with one of the suffixes can be written to that path. read: what the command reads. Raises: UsageError."""
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder: expected the name of a file")
     if not path.parent.is_dir():
@@ -45,24 +101,10 @@ def require_parent(path: Path, option: str = "--out", inputs: Iterable[Path | No
         raise UsageError(f"{option} {path}: the folder {path.parent} {wrong}")
     if path.exists() and not path.is_file():
         raise UsageError(f"{option} {path}: is no regular file: expected the name of a file")
-    for each in inputs:
+    for each in read:
         if each is not None and path.exists() and each.exists() and path.samefile(each):
             raise UsageError(f"{option} {path}: is read by this command: expected another name")
     _require_writable(path.parent, f"{option} {path}")
-
-
-def require_avatar(path: Path, inputs: Iterable[Path | None] = ()) -> None:
-    """An avatar can be written to that path: a .npz, which replaces an avatar only. Raises: UsageError."""
-    require_suffix(path, (".npz",))
-    require_parent(path, inputs=inputs)
-    if path.exists():
-        try:
-            with zipfile.ZipFile(path) as archive:
-                mine = {"header.npy", "skinning_weights.npy"} <= set(archive.namelist())
-        except (zipfile.BadZipFile, OSError):
-            mine = False
-        if not mine:
-            raise UsageError(f"--out {path}: exists and is no avatar: expected another name")
 
 
 def require_folder(path: Path, option: str = "--out") -> None:
@@ -86,7 +128,7 @@ def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterab
         raise UsageError(f"--out {error}") from error
 
 
-def _require_writable(folder, named):
+def _require_writable(folder: Path, named: str) -> None:
     """Tried, because permissions do not tell of full, read-only and network disks."""
     try:
         tempfile.TemporaryFile(dir=folder).close()
@@ -100,26 +142,6 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 
     if (unless is None or folder.resolve() != unless.resolve()) and (found := contents(folder)):
         say(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}")
-
-
-def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:
-    """The name of a file ends as its format requires. Raises: UsageError."""
-    if path.suffix.lower() not in suffixes:
-        raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")
-
-
-def require_at_least(least: float | int, **values: float | int | None) -> None:
-    """Numbers by the name of their option are not too small; None is no number. Raises: UsageError."""
-    require_between(least, math.inf, **values)
-
-
-def require_between(least: float | int, most: float | int, **values: float | int | None) -> None:
-    """Finite numbers by the name of their option are in [least, most]; None is no number. Raises: UsageError."""
-    for name, value in values.items():
-        if value is not None and not (least <= value <= most and math.isfinite(value)):
-            bounds = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
-            bounds = "a finite number" if least == -math.inf else bounds
-            raise UsageError(f"{option_of(name)} {value}: expected {bounds}")
 
 
 ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
@@ -156,3 +178,9 @@ def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings |
 
         return load_settings(config)
     return None
+
+
+def cores(workers: int | None) -> int:
+    """That many processes, by default one for each core that this one may use."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return available if workers is None else workers

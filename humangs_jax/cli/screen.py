@@ -1,11 +1,10 @@
 """What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next.
 
-Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `begin`, `finish`, `fail` and `end`.
+Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`.
 Results go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what libraries log as well.
 """
 
 import atexit
-import dataclasses
 import io
 import logging
 import os
@@ -98,17 +97,6 @@ and real errors of a program arrive as exceptions.
 """
 
 
-@dataclasses.dataclass
-class _Screen:
-    quiet: bool = False
-    started: float = 0.0
-    measured: progress.Progress = dataclasses.field(default_factory=progress.Progress)
-    next: list[str] = dataclasses.field(default_factory=list)
-
-
-_screen = _Screen()
-
-
 def _show_warning(
     message: Warning | str,
     category: type[Warning],
@@ -159,12 +147,6 @@ def silence(verbose: bool) -> None:
         root.addHandler(handler)
 
 
-def begin(quiet: bool, verbose: bool) -> None:
-    """A command starts."""
-    global _screen
-    _screen = _Screen(quiet, time.perf_counter(), progress.begin(quiet=quiet, lines=verbose))
-
-
 def tell(text: object) -> None:
     """A result that was asked for, such as a report: shown with --quiet too."""
     say(text)
@@ -172,7 +154,7 @@ def tell(text: object) -> None:
 
 def wrote(path: str | Path, what: str) -> None:
     """A file or folder was written."""
-    if not _screen.quiet:
+    if not progress.current().quiet:
         say(f"{path}: {what}")
 
 
@@ -191,19 +173,16 @@ def fail(error: BaseException, verbose: bool) -> None:
 
 def suggest(*command: str | Path) -> None:
     """What to do next: the parts of a command line; paths are quoted, text is not."""
-    _screen.next.append(" ".join(shlex.quote(str(part)) if isinstance(part, Path) else part for part in command))
+    progress.current().next.append(
+        " ".join(shlex.quote(str(part)) if isinstance(part, Path) else part for part in command)
+    )
 
 
 def finish() -> None:
     """The command is done: its stages and their seconds, and what to do next."""
-    seconds, total = _screen.measured.seconds, time.perf_counter() - _screen.started
-    if not _screen.quiet and seconds:
-        parts = ", ".join(f"{name} {took:.1f}" for name, took in seconds.items())
-        say(f"took {total:.1f} s: {parts}")
-    if not _screen.quiet and _screen.next:
-        say(f"next: {'  or  '.join(_screen.next)}")
-
-
-def end() -> None:
-    """Stages of the library are shown no more, however the command has ended."""
-    progress.end()
+    shown = progress.current()
+    if not shown.quiet and shown.seconds:
+        parts = ", ".join(f"{name} {took:.1f}" for name, took in shown.seconds.items())
+        say(f"took {time.perf_counter() - shown.started:.1f} s: {parts}")
+    if not shown.quiet and shown.next:
+        say(f"next: {'  or  '.join(shown.next)}")

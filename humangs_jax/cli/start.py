@@ -8,15 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from humangs_jax.cli.captures import tell_found
-from humangs_jax.cli.options import (
-    ITERATIONS_ALONE,
-    UsageError,
-    first_refinement,
-    require_at_least,
-    require_replaceable,
-    tell_deleted,
-)
+from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 
 if TYPE_CHECKING:
@@ -46,7 +40,7 @@ class Start:
     masks: Path | None = None
     """Folder of the masks, if it is elsewhere."""
     keypoints: Annotated[Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")] = None
-    person: int | None = None
+    person: Annotated[int | None, at_least(0)] = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
     height: float | None = None
     """Of the person without shoes, metres, like --height 1.78: the scale where there is no calibration. Default: that of an
@@ -69,7 +63,6 @@ class Start:
 
     def run(self) -> None:
         limits = first_refinement(self.refine)
-        require_at_least(0, person=self.person)
         if self.refine not in (None, "0") and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
         if self.masks is not None and self.without_masks:

@@ -1,15 +1,15 @@
 """`humangs train` and `humangs convert`: weights of one's own, and the authors'."""
 
 import dataclasses
-import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_parent, require_suffix
+from humangs_jax.cli.options import Place, UsageError, Workers, cores
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import DATASETS
 
 RAW = DATASETS.where(lambda each: not each.lists)
@@ -18,23 +18,24 @@ if TYPE_CHECKING:
     Kind = str
 else:
     Kind = Literal[tuple(RAW)]
+TENSORS = Place((".safetensors",))
 
 
 @dataclasses.dataclass(frozen=True)
 class ScanViews:
     """Photos that are rendered of scans (thuman)."""
 
-    views: int = 60
+    views: Annotated[int, at_least(1)] = 60
     """Photos of each scan, from random azimuths and elevations of -5 to 15 degrees."""
     near: bool = False
     """All cameras at 2.0 bounding radii: the published "near" test set. Short for --factors 2 2."""
     factors: tuple[float, float] = (1.0, 1.75)
     """Camera distance in bounding radii, uniform between the two."""
-    supersample: int = 3
+    supersample: Annotated[int, at_least(1)] = 3
     """Samples along each pixel's side."""
-    train: int = 2300
+    train: Annotated[int, at_least(0)] = 2300
     """Scans of the training list, the first of the published shuffle."""
-    test: int = 145
+    test: Annotated[int, at_least(0)] = 145
     """Scans of the test list, the next of the shuffle."""
 
 
@@ -49,25 +50,23 @@ class Preprocess:
     source: Positional[Path]
     """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the folder of several."""
     scans: OmitArgPrefixes[ScanViews]
-    out: Path
+    out: Annotated[Path, Place()]
     """The folder to write: one folder for each scan or subject, lists, and manifest.json."""
     body: Path
     """The model of the fits: SMPLX_NEUTRAL.npz or, for scans of THuman2.0, SMPLX_MALE.npz."""
-    size: int = 512
+    size: Annotated[int, at_least(1)] = 512
     """Side of the photos in pixels."""
-    every: int = 10
+    every: Annotated[int, at_least(1)] = 10
     """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     layout: Literal["scenes", "capture"] = "scenes"
     """The published scene lists, or capture folders."""
     shard: str = "0/1"
     """I/N: the I-th of N parts, counted from 0, for job arrays."""
-    workers: int | None = None
+    workers: Workers = None
     """Processes, for scans. Default: as many as cores."""
 
     def run(self) -> None:
         scans = self.scans
-        require_at_least(1, size=self.size, every=self.every, views=scans.views, supersample=scans.supersample)
-        require_at_least(0, train=scans.train, test=scans.test)
         match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
         if match is None or not int(match[1]) < int(match[2]):
             raise UsageError(f"--shard {self.shard}: expected I/N with I from 0 to N - 1, as in 0/8")
@@ -78,8 +77,6 @@ class Preprocess:
             raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
         if not self.body.is_file():
             raise UsageError(f"--body {self.body}: no such file")
-        require_at_least(1, workers=self.workers)
-        require_folder(self.out)
         with stage("starting"):
             from humangs_jax.data.preprocess.run import Settings, preprocess
 
@@ -94,11 +91,9 @@ class Preprocess:
             train=scans.train,
             test=scans.test,
         )
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = cores if self.workers is None else self.workers
         part = int(match[1]), int(match[2])
         with stage("preprocessing"):
-            report = preprocess(self.source, self.out, self.body, settings, part, workers)
+            report = preprocess(self.source, self.out, self.body, settings, part, cores(self.workers))
         wrote(self.out, str(report))
         suggest("humangs train", self.out, "--body", self.body, "--out RUN")
 
@@ -148,29 +143,26 @@ class Train:
     """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs/datasets.md)."""
     body: Path | None = None
     """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz. Default: the body that comes with the package."""
-    out: Path = Path("runs/train")
+    out: Annotated[Path, Place()] = Path("runs/train")
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
-    on_the_fly: int = 0
+    on_the_fly: Annotated[int, at_least(0)] = 0
     """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
     validation: Path | None = None
     """Other people to evaluate on now and then: anything that DATA accepts."""
-    steps: int | None = None
+    steps: Annotated[int | None, at_least(1)] = None
     """Length of the run. Default: that of the configuration. More than a finished run has: it goes on, with the learning rate of
     the longer run."""
     init_weights: Path | None = None
     """Start from these weights, and their network, instead of random ones."""
-    fsdp: int | None = None
+    fsdp: Annotated[int | None, at_least(1)] = None
     """How many devices share one copy of parameters and moments. Default: all."""
     diagnose: bool = False
     """Do not train, but repeat the first step of the run that failed (or the next one) and name the first stage whose
     numbers are not finite."""
 
     def run(self) -> None:
-        require_at_least(0, on_the_fly=self.on_the_fly)
-        require_at_least(1, steps=self.steps, fsdp=self.fsdp)
-        require_folder(self.out)
         if self.data is None and not self.on_the_fly:
             raise UsageError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
         with stage("starting"):
@@ -230,9 +222,9 @@ class Convert:
 
     checkpoint: Positional[Path]
     """.pt with a state dict under 'model', or that state dict as .safetensors."""
-    out: Path = Path("weights.safetensors")
+    out: Annotated[Path, TENSORS] = Path("weights.safetensors")
     """The weights file to write."""
-    losses: Path | None = None
+    losses: Annotated[Path | None, TENSORS] = None
     """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and evaluation."""
     head_width: int | None = None
     """Features per attention head, needed if no shape tells it (networks without q_norm and k_norm)."""
@@ -243,13 +235,6 @@ class Convert:
 
     def run(self) -> None:
         out, losses, checkpoint = self.out, self.losses, self.checkpoint
-        for option, path in (("--out", out), ("--losses", losses)):
-            if path is None:
-                continue
-            require_suffix(path, (".safetensors",), option)
-            if path.exists() and checkpoint.exists() and path.samefile(checkpoint):
-                raise UsageError(f"{option} {path} is the checkpoint itself")
-            require_parent(path, option)
         if losses is not None and losses.resolve() == out.resolve():
             raise UsageError(f"--losses {losses}: the same file as --out")
         if not checkpoint.exists():

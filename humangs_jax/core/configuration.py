@@ -17,7 +17,7 @@ import numbers
 import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -37,8 +37,15 @@ class Range(NamedTuple):
     low: float
     high: float
 
-    def __str__(self):
-        return f"{self.low:,.15g} to {self.high:,.15g}"
+    def __str__(self) -> str:
+        if self.high < LARGEST:
+            return f"{self.low:,.15g} to {self.high:,.15g}"
+        return f"at least {self.low:,.15g}" if self.low > -LARGEST else "a finite number"
+
+
+def at_least(low: float | int) -> Range:
+    """Finite numbers from `low` on."""
+    return Range(low, LARGEST)
 
 
 InputSide = Annotated[int, Range(1, 2048)]
@@ -128,11 +135,11 @@ def check_fields(config: Any) -> None:
 
 
 @functools.cache
-def _annotations(cls):
+def _annotations(cls: Any) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _fits(value, annotation):
+def _fits(value: Any, annotation: Any) -> bool:
     """Whether a value is what an annotation says, as far as that is plain; parts and arrays may be anything."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
@@ -147,14 +154,10 @@ def _fits(value, annotation):
     return origin is not tuple or isinstance(value, tuple)
 
 
-def _in_words(annotation):
-    options = (
-        typing.get_args(annotation)
-        if typing.get_origin(annotation) in (typing.Union, types.UnionType)
-        else [annotation]
-    )
+def _in_words(annotation: Any) -> str:
+    union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     words = []
-    for option in options:
+    for option in typing.get_args(annotation) if union else [annotation]:
         literal = typing.get_origin(option) is Literal
         words += map(repr, typing.get_args(option)) if literal else [_named(option).replace("NoneType", "None")]
     return words[0] if len(words) == 1 else f"one of {', '.join(words)}"
@@ -201,7 +204,7 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
     return config
 
 
-def _varied(config, names, value, path):
+def _varied(config: Any, names: list[str], value: Any, path: str) -> Any:
     fields = [f.name for f in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
     if names[0] not in fields:
         raise ValueError(f"{path}: {type(config).__name__} has no field {names[0]!r}; its fields are {fields}")
@@ -226,15 +229,16 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
 def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
     """Of the fields that have one."""
     hints = typing.get_type_hints(cls, include_extras=True)
-    found = {field.name: tuple(_ranges_in(hints[field.name])) for field in dataclasses.fields(cls)}
+    found = {field.name: tuple(marks_in(hints[field.name], Range)) for field in dataclasses.fields(cls)}
     return {name: ranges for name, ranges in found.items() if ranges}
 
 
-def _ranges_in(annotation):
+def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
+    """What of one kind is said of an annotation or a part of it, as in `Annotated[int, Range(1, 9)] | None`."""
     if typing.get_origin(annotation) is Annotated:
-        yield from (each for each in annotation.__metadata__ if isinstance(each, Range))
+        yield from (each for each in annotation.__metadata__ if isinstance(each, kind))
     for part in typing.get_args(annotation):
-        yield from _ranges_in(part)
+        yield from marks_in(part, kind)
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:
@@ -254,12 +258,12 @@ def _plain(value: Any, kind: bool = False) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _holds_part(annotation):
+def _holds_part(annotation: Any) -> bool:
     """Whether a field holds a part, or a part or None."""
     return _is_protocol(annotation) or any(map(_is_protocol, typing.get_args(annotation)))
 
 
-def _is_protocol(annotation):
+def _is_protocol(annotation: Any) -> bool:
     return getattr(annotation, "_is_protocol", False)
 
 
@@ -296,12 +300,14 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
         if len(items) == len(value):
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
-    elif _matches(value, annotation):
-        return float(value) if annotation is float else value
+    elif not _is_protocol(annotation) and _fits(value, annotation):
+        most = LARGEST if annotation is float else LARGEST_INTEGER
+        if not isinstance(value, int | float) or abs(value) <= most:  # nor NaN
+            return float(value) if annotation is float else value
     raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
 
 
-def _find_part(kind, protocol, path):
+def _find_part(kind: Any, protocol: Any, path: str) -> type:
     """The class that a "kind" names."""
     # not issubclass: it refuses protocols with attributes, and a field without a default is no attribute of its class
     members = [member for member in vars(protocol) if not member.startswith("_")]
@@ -319,7 +325,7 @@ def _find_part(kind, protocol, path):
     return known[name]
 
 
-def _build_dataclass(cls, values, path):
+def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
     annotations = typing.get_type_hints(cls)
@@ -337,17 +343,5 @@ def _build_dataclass(cls, values, path):
         raise ValueError(f"{path}: {cls.__name__}: {error}") from error
 
 
-def _named(annotation):
+def _named(annotation: Any) -> str:
     return annotation.__name__ if isinstance(annotation, type) else str(annotation)
-
-
-def _matches(value, annotation):
-    """Whether a JSON value fits one of the plain annotations that configurations use."""
-    origin = typing.get_origin(annotation)
-    if origin is Literal:
-        return value in typing.get_args(annotation)
-    if origin in (typing.Union, types.UnionType):
-        return any(_matches(value, option) for option in typing.get_args(annotation))
-    if annotation is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
-    return type(value) is annotation and (annotation is not int or abs(value) < LARGEST_INTEGER)

@@ -17,7 +17,7 @@ import threading
 import time
 import unicodedata
 import weakref
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any
 
 SHOWN = {"Zs", "Cn", "Co"}
@@ -49,6 +49,13 @@ def _escaped(c):
     return c.encode("unicode_escape").decode("ascii")
 
 
+def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+    """Lines of a table: the first columns (left) aligned to the left, the others to the right; rows may end early."""
+    widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
+    aligned = lambda row: (f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row))
+    return ["  ".join(aligned(row)).rstrip() for row in rows]
+
+
 TICK = 0.2
 """Seconds between two updates of the line."""
 CLEAR = "\r\033[K"
@@ -59,16 +66,18 @@ CLEAR = "\r\033[K"
 class Progress:
     """What is shown, and what was measured.
 
-    ticking: a line on stderr counts the seconds of a stage while it runs. lines: each stage leaves a line there. bars: whether
-    bars are shown at all. seconds: of the finished outermost stages, by name. names: of the stages that run, paused: a bar has
-    the line.
+    ticking: a line on stderr counts the seconds of a stage while it runs. lines: each stage leaves a line there. quiet: neither
+    stages nor bars are shown. seconds: of the finished outermost stages by name, since `started`. names: of the stages that
+    run; paused: a bar has the line. next: what the user may do next, for whoever began.
     """
 
     ticking: bool = False
     lines: bool = False
-    bars: bool = True
+    quiet: bool = False
+    started: float = dataclasses.field(default_factory=time.perf_counter)
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     names: list[str] = dataclasses.field(default_factory=list)
+    next: list[str] = dataclasses.field(default_factory=list)
     paused: bool = False
 
 
@@ -83,7 +92,12 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
     Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever stderr goes.
     """
     global _current
-    _current = Progress(ticking=sys.stderr.isatty() and not quiet, lines=lines and not quiet, bars=not quiet)
+    _current = Progress(ticking=sys.stderr.isatty() and not quiet, lines=lines and not quiet, quiet=quiet)
+    return _current
+
+
+def current() -> Progress:
+    """What is shown now."""
     return _current
 
 
@@ -147,12 +161,12 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
     """
     from tqdm import tqdm
 
-    if shown and _current.bars and _current.ticking and _current.names:
+    if shown and _current.ticking and _current.names:
         _current.paused = True
         sys.stderr.write(CLEAR)
     if how.get("desc") is not None:
         how["desc"] = printable(how["desc"])
-    made = tqdm(iterable, disable=not (shown and _current.bars), **how)
+    made = tqdm(iterable, disable=not shown or _current.quiet, **how)
     if not made.disable:
         _bars.add(made)
     return made

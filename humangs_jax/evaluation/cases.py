@@ -33,6 +33,7 @@ from humangs_jax.network.pixel_aligned import (
     project_vertices,
     visible_vertices,
 )
+from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
@@ -121,7 +122,9 @@ def find_people(
     return People(tuple(case.name for case in cases), cases.__getitem__)
 
 
-def _load(folder, inputs, indices, body, reconstructs):
+def _load(
+    folder: Path, inputs: int | None, indices: Indices | None, body: BodyModel | None, reconstructs: bool
+) -> Case:
     capture, held_out = load_capture(folder, body=body), folder / HELD_OUT
     if indices is not None or not (held_out / "capture.json").is_file():
         return _split(folder.name, capture, inputs, indices, reconstructs)
@@ -135,7 +138,9 @@ def _model(body):
     return load_body(body) if isinstance(body, str | Path) else body
 
 
-def _find_in_data_set(path, inputs, indices, body, reconstructs):
+def _find_in_data_set(
+    path: Path, inputs: int | None, indices: Indices | None, body: BodyModel | str | Path | None, reconstructs: bool
+) -> People:
     """The people of a data set; photos are read when a case is loaded."""
     file_body = FileBody(body) if isinstance(body, BodyModel) else FileBody.load(body)
     people = open_people(path, file_body)
@@ -145,16 +150,15 @@ def _find_in_data_set(path, inputs, indices, body, reconstructs):
         subject, size, name = people[index].subject, people[index].size, names[index]
         chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, inputs, indices, reconstructs)
         if len(targets) > MOST_TARGETS:
-            raise ValueError(
-                f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
-            )
+            problem = f"{len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
+            raise ValueError(f"{name}: {problem}")
         seen = subject.capture(chosen, file_body, size) if chosen else None
         return Case(name, subject.capture(targets, file_body, size), seen)
 
     return People(names, load)
 
 
-def _short_names(paths):
+def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """The last parts of the paths, as many as tell all of them apart: ActorsHQ has a Sequence1 of every actor."""
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = tuple("_".join(path.parts[-parts:]) for path in paths)
@@ -163,7 +167,7 @@ def _short_names(paths):
     return tuple(f"{index:04d}" for index in range(len(paths)))
 
 
-def _split(name, capture, inputs, indices, reconstructs):
+def _split(name: str, capture: Capture, inputs: int | None, indices: Indices | None, reconstructs: bool) -> Case:
     """Inputs and targets of one capture."""
     cam_from_world = np.asarray(capture.cameras.cam_from_world)
     chosen, targets = choose_views(name, capture.frames, cam_from_world, inputs, indices, reconstructs)
@@ -213,7 +217,7 @@ def spread_views(
     return sorted(int(around[i * len(same) // count]) for i in range(count))
 
 
-def _from_source(source, index, name, inputs, body):
+def _from_source(source: Source, index: int, name: str, inputs: int | None, body: BodyModel | None) -> Case:
     count = inputs or (DEFAULT_INPUTS if DEFAULT_INPUTS in source.input_counts else source.input_counts[0])
     example = source.example(0, index, count)
     body = load_body() if body is None else body
@@ -308,16 +312,15 @@ def predictions_method(folder: str | Path, people: int) -> Method:
         read = [_read_prediction(file, size, background) for _, file in found]
         coverage = [alpha for _, alpha in read if alpha is not None]
         if coverage and len(coverage) < len(read):
-            raise ValueError(
-                f"{place}: {len(coverage)} of {len(read)} images have an alpha channel: expected all or none"
-            )
+            counts = f"{len(coverage)} of {len(read)} images"
+            raise ValueError(f"{place}: {counts} have an alpha channel: expected all or none")
         images = np.stack([image for image, _ in read])
         return Predicted(images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing)
 
     return method
 
 
-def _prediction(place, name, index):
+def _prediction(place: Path, name: str, index: int) -> Path | None:
     candidates = (place / f"{stem}{suffix}" for stem in (name, f"view_{index:03d}") for suffix in SUFFIXES)
     return next((file for file in candidates if file.is_file()), None)
 
@@ -332,15 +335,13 @@ def _read_prediction(file, size, background):
     return image, alpha
 
 
-def _nothing(case, missing):
+def _nothing(case: Case, missing: tuple[str, ...]) -> Predicted:
     return Predicted(case.truth.images[:0], None, (), missing)
 
 
 @functools.cache
 def shipped_weights() -> tuple[Variables, HumanGSConfig]:
     """The network that comes with the package."""
-    from humangs_jax.network.weights import load_weights
-
     return load_weights()
 
 
@@ -364,8 +365,6 @@ def choose_method(
     if method is not None:
         return getattr(method, "__name__", "method"), method
     if isinstance(weights, str | Path):
-        from humangs_jax.network.weights import load_weights
-
         return Path(weights).name, weights_method(*load_weights(weights))
     if weights is None:
         return "shipped weights", weights_method(*shipped_weights())

@@ -27,7 +27,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.usable_views import empty_views
-from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people
+from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
 from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
 from humangs_jax.evaluation.scores import missing_reasons, on_background, score_names, score_views
 from humangs_jax.evaluation.tables import (
@@ -63,12 +63,14 @@ _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
 class Gallery:
-    """The images of a page, made small as they come: those of the `limit` lowest PSNR, and the inputs of every person shown."""
+    """The images of a page, made small as they come: truth, ours, error of those of the `limit` lowest PSNR; inputs of every
+    person.
+    """
 
-    def __init__(self, limit: int):
+    def __init__(self, limit: int) -> None:
+        self.inputs: dict[str, list[str]] = {}
         self._limit = limit
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
-        self._inputs: dict[str, list[str]] = {}
 
     def add(
         self, row: int, psnr: float | None, truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]
@@ -85,20 +87,15 @@ class Gallery:
 
     def add_inputs(self, person: str, images: Float[np.ndarray, "v h w 3"]) -> None:
         """What the method saw of a person."""
-        self._inputs[person] = [_data_url(image, INPUT_SIDE) for image in images] if self._limit else []
+        self.inputs[person] = [_data_url(image, INPUT_SIDE) for image in images] if self._limit else []
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
-        """By row: truth, ours and error."""
+        """By row."""
         return {row: images for _, row, images in self._shots}
 
-    @property
-    def inputs(self) -> dict[str, list[str]]:
-        """By person."""
-        return self._inputs
 
-
-def _data_url(image, side):
+def _data_url(image: np.ndarray, side: int) -> str:
     from PIL import Image
 
     height, width = image.shape[:2]
@@ -112,9 +109,7 @@ def _data_url(image, side):
 
 def page_html(evaluation: dict[str, Any], notes: list[str], gallery: Gallery) -> str:
     """The page as text. evaluation: what `Evaluation.to_json` gives."""
-    shown = {
-        person for row, image in enumerate(evaluation["images"]) if row in gallery.shots for person in [image["person"]]
-    }
+    shown = {evaluation["images"][row]["person"] for row in gallery.shots}
     data = evaluation | {
         "notes": notes,
         "columns": {name: column._asdict() for name, column in COLUMNS.items()},
@@ -281,7 +276,7 @@ def evaluate(
     rows, missing, sides, shown_inputs = [], [], set(), []
     masks, alphas, everything = True, True, False
     gallery = Gallery(page_images)
-    for index in _progress(range(len(people.names)), progress):
+    for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
         case = people.load(index)
         predicted = _without_nobody(case, predict(case, rules.behind))
         person = printable(case.name)  # of a folder: every report gets a name of one line
@@ -323,7 +318,7 @@ def evaluate(
     return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
 
 
-def _without_nobody(case, predicted):
+def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
     """The predictions of views whose true mask shows somebody: white compared with white would raise the mean."""
     empty = set(empty_views(case.truth)) & set(predicted.views)
     if not empty:
@@ -339,19 +334,15 @@ def _without_nobody(case, predicted):
     )
 
 
-def _progress(indices, progress):
-    return bar(indices, desc="evaluate", unit="person", shown=progress)
-
-
-def _listed(names):
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
 
 
-def _counted(count, one, many):
+def _counted(count: int, one: str, many: str) -> str:
     return f"{count} {one if count == 1 else many}"
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """Settings as JSON; the kind of a crop by the name of its class."""
     if not dataclasses.is_dataclass(value):
         return list(value) if isinstance(value, tuple) else value

@@ -6,7 +6,7 @@ often photographed. An interval is of the mean over people; with one person, ove
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,51 +76,42 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
     return {name: sum(values) / len(values) if len(values) == len(listed) else None for name, values in known.items()}
 
 
-def known_mean(rows: Iterable[Mapping[str, float | None]], name: str) -> float | None:
-    """The mean of a score over those that have it, such as images with patches; None if none has."""
-    values = [value for row in rows if (value := row.get(name)) is not None]
-    return sum(values) / len(values) if values else None
+def known_means(rows: Sequence[Row]) -> Row:
+    """Means of the scores over those that have them, such as images with patches; None for what none has."""
+    known = {name: [value for row in rows if (value := row[name]) is not None] for name in rows[0]}
+    return {name: sum(values) / len(values) if values else None for name, values in known.items()}
 
 
-def grouped(rows: Sequence[Scored], key: Callable[[Scored], Any]) -> dict[Any, list[Scored]]:
-    """Rows by a key, in the order of first appearance."""
-    groups: dict[Any, list[Scored]] = {}
-    for row in rows:
-        groups.setdefault(key(row), []).append(row)
+def grouped(rows: Iterable[tuple[Any, Row]]) -> dict[Any, list[Row]]:
+    """Scores by a key, in the order of first appearance."""
+    groups: dict[Any, list[Row]] = {}
+    for key, row in rows:
+        groups.setdefault(key, []).append(row)
     return groups
+
+
+def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
+    """Scores by person and frame."""
+    return {key: known_means(images) for key, images in grouped(((r.person, r.frame), r.scores) for r in rows).items()}
 
 
 def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
     """Scores by person: means over the images of a frame, then over frames."""
-    names = rows[0].scores
-    frames = {
-        place: {name: known_mean([row.scores for row in images], name) for name in names}
-        for place, images in grouped(rows, lambda row: (row.person, row.frame)).items()
-    }
-    people = dict.fromkeys(person for person, _ in frames)
-    return {
-        person: {name: known_mean([row for (who, _), row in frames.items() if who == person], name) for name in names}
-        for person in people
-    }
+    frames = _frame_means(rows)
+    return {key: known_means(found) for key, found in grouped((who, row) for (who, _), row in frames.items()).items()}
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
     """The mean of each score with its interval, see the head of this module; None for scores that no image has."""
-    people = person_means(rows)
-    frames = grouped(rows, lambda row: (row.person, row.frame))
-    if len(people) > 1:
-        over, units = "people", list(people.values())
-    elif len(frames) > 1:
-        over = "frames"
-        units = [
-            {name: known_mean([row.scores for row in images], name) for name in rows[0].scores}
-            for images in frames.values()
-        ]
-    else:
-        over, units = "images", [row.scores for row in rows]
+    levels = {
+        "people": list(person_means(rows).values()),
+        "frames": list(_frame_means(rows).values()),
+        "images": [row.scores for row in rows],
+    }
+    over = next((over for over, units in levels.items() if len(units) > 1), "images")
     found: dict[str, Mean | None] = {}
     for name in rows[0].scores:
-        values = [value for unit in units if (value := unit[name]) is not None]
+        values = [value for unit in levels[over] if (value := unit[name]) is not None]
         found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
     return found
 

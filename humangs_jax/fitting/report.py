@@ -13,6 +13,7 @@ import numpy as np
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.progress import text_table
 from humangs_jax.fitting.residuals.priors import pose_prior, violations
 from humangs_jax.fitting.solve import Outcome
 from humangs_jax.fitting.swaps import Swap
@@ -139,15 +140,15 @@ def _plain(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _stage_rows(stages):
-    rows = ["stage        converged  steps  cost before -> after"]
+def _stage_rows(stages: Sequence[Stage]) -> list[str]:
+    rows = [["stage", "converged", "steps", "cost before -> after"]]
     for stage in stages:
-        converged = f"{stage.converged} of {stage.runs}"
-        rows.append(f"{stage.name:<12} {converged:>9}  {stage.steps:>5.0f}  {stage.before:.4g} -> {stage.after:.4g}")
-    return rows
+        cost = f"{stage.before:.4g} -> {stage.after:.4g}"
+        rows.append([stage.name, f"{stage.converged} of {stage.runs}", f"{stage.steps:.0f}", cost])
+    return text_table(rows)
 
 
-def _view_rows(views):
+def _view_rows(views: Sequence[ViewReport]) -> list[str]:
     """A table with the columns that are known."""
     by_keypoints, by_masks = any(v.keypoints for v in views), any(v.iou_after is not None for v in views)
     shown = views
@@ -155,23 +156,21 @@ def _view_rows(views):
         error = lambda view: np.nan_to_num(view.median if by_keypoints else 1 - (view.iou_after or 0.0), nan=np.inf)
         worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
         shown = [views[i] for i in sorted(worst)]
-    width = max(4, *(len(view.name) for view in shown))
-    header = f"{'view':<{width}}"
-    header += "  keypoints  median error  90 % below  outliers" if by_keypoints or not by_masks else ""
-    header += "  IoU before  after" if by_masks else ""
-    rows = [header]
+    rows = [["view"]]
+    if by_keypoints or not by_masks:
+        rows[0] += ["keypoints", "median error", "90 % below", "outliers"]
+    rows[0] += ["IoU before", "after"] if by_masks else []
     for view in shown:
-        row = f"{view.name:<{width}}"
+        row = [view.name]
         if by_keypoints or not by_masks:
-            errors = f"{view.median:>9.1f} px  {view.high:>7.1f} px" if view.keypoints else f"{'-':>12}  {'-':>10}"
-            row += f"  {view.keypoints:>9}  {errors}  {view.outliers:>8.0%}"
+            errors = [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
+            row += [str(view.keypoints), *errors, f"{view.outliers:.0%}"]
         if by_masks:
             known = view.iou_before is not None and np.isfinite(view.iou_before)
-            row += f"  {view.iou_before:>10.3f}  {view.iou_after:.3f}" if known else f"  {'no mask':>10}"
+            row += [f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"] if known else ["no mask"]
         rows.append(row)
-    if len(views) > ROWS:
-        rows.append(f"{'...':<{width}}  {len(views) - ROWS} more that fit better")
-    return rows
+    lines = text_table(rows)
+    return lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
 
 
 # What points to a mistake --------------------------------------------------------------------------------------------

@@ -97,49 +97,49 @@ class _Counted:
         return self._table[byte]
 
 
-def _checked_key(key):
+def _checked_key(key: Any) -> Any:
     parts = key if type(key) is tuple and len(key) <= 4 else (key,)
     if not all(type(x) in (str, bytes, bool) or (type(x) is int and abs(x) < LARGEST_KEY) for x in parts):
         raise Refused("a dict with keys other than strings and small integers")
     return key
 
 
-def _fill(mapping, items):
+def _fill(mapping: Any, items: list[Any]) -> None:
     if type(mapping) is not dict:
         raise Refused("items of what is no dict")
     mapping.update((_checked_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
 
 
-def _set_item(reader):
+def _set_item(reader: Any) -> None:
     value, key = reader.stack.pop(), reader.stack.pop()
     _fill(reader.stack[-1], [key, value])
 
 
-def _set_items(reader):
+def _set_items(reader: Any) -> None:
     items = reader.pop_mark()
     _fill(reader.stack[-1], items)
 
 
-def _dict(reader):
+def _dict(reader: Any) -> None:
     items, made = reader.pop_mark(), {}
     _fill(made, items)
     reader.append(made)
 
 
-def _extend(reader, items):
+def _extend(reader: Any, items: list[Any]) -> None:
     if type(reader.stack[-1]) is not list:
         raise Refused("elements of what is no list")
     reader.stack[-1].extend(items)
 
 
-def _reduce(reader):
+def _reduce(reader: Any) -> None:
     arguments, function = reader.stack.pop(), reader.stack.pop()
     if type(function) is not Call or type(arguments) is not tuple:
         raise Refused("refused a call of what is no function of arrays")
     reader.append(function.function(*arguments))
 
 
-def _build(reader):
+def _build(reader: Any) -> None:
     state = reader.stack.pop()
     target = reader.stack[-1]
     if isinstance(target, StandIn):
@@ -148,7 +148,7 @@ def _build(reader):
         raise Refused("refused a state for what has none")
 
 
-def _bytearray(reader):
+def _bytearray(reader: Any) -> None:
     count = int.from_bytes(reader.read(8), "little")
     data = reader.read(min(count, 1 << 62))
     if len(data) != count:
@@ -190,7 +190,7 @@ class _Dtype(StandIn):
             return None
 
 
-def _dtype(code="", *_):
+def _dtype(code: Any = "", *_: Any) -> "_Dtype":
     made = _Dtype()
     made.state["code"] = code.decode("latin1") if isinstance(code, bytes) else code
     return made
@@ -221,19 +221,19 @@ class _Array(StandIn):
         return plain_array(data, dtype, sizes[::-1]).T if columns_first else plain_array(data, dtype, sizes)
 
 
-def _made_array(shape, dtype, columns_first, data):
+def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Array":
     array = _Array()
     array.set_state((1, shape, dtype, columns_first, data))
     return array
 
 
-def _encode(text="", encoding="latin1", *_):
+def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
         raise Refused("refused to encode anything but latin1")
     return text  # stands for its bytes, and takes no further memory: `_Array` encodes it
 
 
-def _numbers(value):
+def _numbers(value: Any) -> np.ndarray:
     """A part of a sparse or chumpy array. Never one of these again: shared ones could be nested to any size."""
     if not isinstance(value, _Array):
         raise ValueError(f"expected an array, got {type(value).__name__}")
@@ -241,23 +241,27 @@ def _numbers(value):
 
 
 class _Sparse(StandIn):
-    def coordinates(self, count: int) -> tuple[Any, ...]:
-        raise NotImplementedError
+    """A matrix by the coordinates of its entries, or compressed along one axis, whose entries are counted."""
 
-    def compressed(self, count):
-        """Indices within the rows or columns, and of which row or column each is."""
+    axis: int | None = None
+
+    def _places(self, count: int) -> list[np.ndarray]:
+        """The row and the column of each entry."""
+        if self.axis is None:
+            return [_numbers(x) for x in self.state.get("coords") or (self.state["row"], self.state["col"])]
         ends = _numbers(self.state["indptr"]).astype(np.int64, casting="safe")
         steps = np.diff(ends)
         if ends.ndim != 1 or not len(ends) or ends[0] != 0 or (steps < 0).any() or ends[-1] != count:
             raise ValueError("index pointers that do not count the entries")
-        return _numbers(self.state["indices"]), np.repeat(np.arange(len(steps)), steps)
+        places = [np.repeat(np.arange(len(steps)), steps), _numbers(self.state["indices"])]
+        return places[:: 1 if self.axis == 0 else -1]
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["_shape"], _numbers(self.state["data"])
         if not (isinstance(shape, tuple) and len(shape) == 2 and all(type(n) is int and n >= 0 for n in shape)):
             raise ValueError("expected a shape of two sizes")
         check_limit("plain_bytes", math.prod(shape) * data.itemsize, "bytes of a sparse matrix")
-        where = [x.astype(np.int64, casting="safe") for x in self.coordinates(data.size)]
+        where = [x.astype(np.int64, casting="safe") for x in self._places(data.size)]
         for index, size in zip(where, shape, strict=True):
             if index.shape != data.shape or (index.size and not 0 <= index.min() <= index.max() < size):
                 raise ValueError(f"indices that do not fit the shape {shape}")
@@ -266,20 +270,12 @@ class _Sparse(StandIn):
         return full
 
 
-class _SparseColumns(_Sparse):
-    def coordinates(self, count: int) -> tuple[Any, ...]:
-        return self.compressed(count)
-
-
 class _SparseRows(_Sparse):
-    def coordinates(self, count: int) -> tuple[Any, ...]:
-        return self.compressed(count)[::-1]
+    axis = 0
 
 
-class _SparseEntries(_Sparse):
-    def coordinates(self, count: int) -> tuple[Any, ...]:
-        both = self.state["coords"] if "coords" in self.state else (self.state["row"], self.state["col"])
-        return tuple(_numbers(x) for x in both)
+class _SparseColumns(_Sparse):
+    axis = 1
 
 
 class _Chumpy(StandIn):
@@ -310,13 +306,13 @@ _NAMES: dict[tuple[str, str], Any] = {
     **{(module, "object"): object for module in ("builtins", "__builtin__")},  # only named, too
     ("scipy.sparse", "csc_matrix"): Call(_SparseColumns),
     ("scipy.sparse", "csr_matrix"): Call(_SparseRows),
-    ("scipy.sparse", "coo_matrix"): Call(_SparseEntries),
+    ("scipy.sparse", "coo_matrix"): Call(_Sparse),
     ("chumpy.ch", "Ch"): Call(_Chumpy),
     ("chumpy.reordering", "Select"): Call(_ChumpySelection),
 }
 
 
-def _instance(cls):
+def _instance(cls: Any) -> StandIn:
     if type(cls) is not Call or not isinstance(cls.function, type) or not issubclass(cls.function, StandIn):
         raise Refused("refused to make an object of another class")
     return cls.function()
@@ -343,7 +339,7 @@ def as_array(value: Any) -> np.ndarray:
     raise ValueError(f"expected an array, got {type(value).__name__}")
 
 
-def _check_leaves(value):
+def _check_leaves(value: Any) -> None:
     """Refuses lists that are large, deep or hold other things than numbers; in pickles one list may stand in many places."""
     waiting, left = [(value, 0)], LONGEST_LIST
     while waiting:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from humangs_jax.core.array_types import PyTree
+from humangs_jax.core.progress import text_table
 from humangs_jax.network.stages import inexact_leaves
 
 _COUNTED = {
@@ -199,6 +200,4 @@ def _table(reports: Sequence[StageReport]) -> list[str]:
             row[7] = str(sum(leaf.bad for leaf in report.gradients))
             row[8] = f"{report.gradient_norm:.3g}"
         rows.append(row)
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    aligned = lambda row: [row[0].ljust(widths[0]), *(x.rjust(w) for x, w in zip(row[1:], widths[1:], strict=True))]
-    return ["  ".join(aligned(row)).rstrip() for row in rows]
+    return text_table(rows)

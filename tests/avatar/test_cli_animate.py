@@ -37,7 +37,7 @@ def folder(tmp_path, monkeypatch):
 
 BAD = {
     "--azimuth nan: expected": ("animate", "--azimuth", "nan"),
-    "--size -5: expected 1 to 8192 pixels": ("animate", "--size", "-5"),
+    "--size -5: expected 1 to 8,192": ("animate", "--size", "-5"),
     "--height 100000: expected": ("render", "--height", "100000"),
     "--background 'blu': expected a color": ("animate", "--background", "blu"),
     "--out b.mp4: .mp4 has no transparency": ("animate", "--background", "transparent", "--out", "b.mp4"),
@@ -46,7 +46,7 @@ BAD = {
     "--out a.webm: is a folder": ("animate", "--out", "a.webm"),
     "--out file: is a file": ("render", "--out", "file"),
     "--out none/b.mp4: the folder none does not exist": ("animate", "--out", "none/b.mp4"),
-    "--fps 0.0: expected": ("animate", "--fps", "0"),
+    "--fps 0: expected": ("animate", "--fps", "0"),
     "--fps nan: expected": ("render", "--fps", "nan"),
     "--views -1: expected at least 1": ("render", "--views", "-1"),
     "--start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),

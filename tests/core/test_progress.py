@@ -110,3 +110,13 @@ def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
         shown.update(2)
     captured = capsys.readouterr().err
     assert "humangs: warning: odd" in lines_of(captured) and r"a\x1b[2J\nb" in captured and "\x1b[2J" not in captured
+
+
+def test_tables_are_aligned_and_rows_may_end_early():
+    rows = [["view", "error", "share"], ["a long name", "1.0 px", "7%", "!"], ["b", "-"]]
+    assert progress.text_table(rows) == [
+        "view          error  share",
+        "a long name  1.0 px     7%  !",
+        "b                 -",
+    ]
+    assert progress.text_table([["a", "b"], ["cc", "d"]], left=2) == ["a   b", "cc  d"]

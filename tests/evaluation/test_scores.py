@@ -152,6 +152,25 @@ def test_patches_are_those_that_are_more_than_half_person(networks):
     assert row["patch_lpips_alex"] == pytest.approx(expected[2], rel=1e-5)
 
 
+def test_patches_that_are_mostly_background_do_not_count():
+    """Two patches of 96 x 80 pixels, one above the other: people fill more than half of the upper one alone."""
+    predicted, truth, masks = (x.copy() for x in random_views(5, 1))
+    masks[:, :40], masks[:, 40:] = 1, 0
+    (row,) = scores.score_views(predicted, capture_from(truth, masks), PROTOCOLS["lvsm"])
+    assert row["patches"] == 1 and row["patch_psnr"] == pytest.approx(psnr(predicted[0, :64, :64], truth[0, :64, :64]))
+
+
+@pytest.mark.parametrize("background", ["black", "white", "dataset"])
+def test_a_photo_on_white_is_the_same_person_on_another_background(background):
+    """Where the mask is soft, too: color * mask + background * (1 - mask)."""
+    random = np.random.default_rng(0)
+    color, mask = random.random((9, 7, 3)), random.random((9, 7))
+    on = lambda grey: color * mask[..., None] + grey * (1 - mask[..., None])
+    protocol = dataclasses.replace(PROTOCOLS["humangs"], background=background)
+    found = scores.on_background(on(1.0).astype(np.float32), mask.astype(np.float32), protocol)
+    np.testing.assert_allclose(found, on(protocol.behind), atol=1e-6)  # of float32
+
+
 def test_images_of_other_sizes_share_the_programs():
     """Crops of one bucket, as of many people, compile once."""
     rng = np.random.default_rng(0)

@@ -92,18 +92,9 @@ for kind, data in ARCHIVES.items():
 for gigabytes in (1, 8):
     for reader in ("npz", "avatar", "smplx npz", "amass", "keypoints npz"):
         case(f"zeros of {gigabytes} GiB", reader, written("a.npz", lambda g=gigabytes: bomb(g)), item=5)
-case(
-    "100,000 members",
-    "npz",
-    written("a.npz", lambda: raw_zip([(f"{i}.npy".encode(), 0, b"", 0) for i in range(100_000)])),
-    item=5,
-)
-case(
-    "100,000 members",
-    "torch zip",
-    written("a.pt", lambda: raw_zip([(f"{i}".encode(), 0, b"", 0) for i in range(100_000)])),
-    item=5,
-)
+many = lambda suffix: lambda: raw_zip([(f"{i}{suffix}".encode(), 0, b"", 0) for i in range(100_000)])
+case("100,000 members", "npz", written("a.npz", many(".npy")), item=5)
+case("100,000 members", "torch zip", written("a.pt", many("")), item=5)
 
 
 # safetensors -----------------------------------------------------------------------------------------------

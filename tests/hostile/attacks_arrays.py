@@ -4,7 +4,7 @@ import json
 import tempfile
 from pathlib import Path
 
-import honest_files
+import honest_files as honest
 import numpy as np
 from hostile_cases import case
 
@@ -31,17 +31,21 @@ def put(name, value, index=(0,)):
     return change
 
 
+def to(**values):
+    return lambda arrays: arrays.update(values)
+
+
 def cast(name, dtype):
     return lambda arrays: arrays.update({name: np.asarray(arrays[name]).astype(dtype)})
 
 
 def header(**changes):
-    return lambda arrays: arrays.update(header=json.dumps(honest_files.AVATAR_HEADER | changes))
+    return to(header=json.dumps(honest.AVATAR_HEADER | changes))
 
 
 AVATARS = {
-    **{f"NaN in {name}": put(name, np.nan) for name in honest_files.avatar_arrays() if name != "faces"},
-    **{f"inf in {name}": put(name, -np.inf) for name in honest_files.avatar_arrays() if name != "faces"},
+    **{f"NaN in {name}": put(name, np.nan) for name in honest.avatar_arrays() if name != "faces"},
+    **{f"inf in {name}": put(name, -np.inf) for name in honest.avatar_arrays() if name != "faces"},
     "opacity 9": put("opacities", 9.0),
     "opacity -1": put("opacities", -1.0),
     "a negative scale": put("scales", -0.1),
@@ -52,7 +56,7 @@ AVATARS = {
     **{f"complex {name}": cast(name, np.complex64) for name in ("means", "colors", "skinning_weights")},
     "words": cast("means", str),
     "bytes": cast("colors", "S4"),
-    "too large for float32": lambda arrays: arrays.update(means=np.full((6, 3), 1e300)),
+    "too large for float32": to(means=np.full((6, 3), 1e300)),
     "a circle of parents": header(parents=[-1, 2, 1]),
     "a parent that is not there": header(parents=[-1, 7, 0]),
     "two roots": header(parents=[-1, -1, 0]),
@@ -63,22 +67,22 @@ AVATARS = {
     "too few names": header(joint_names=["a"]),
     "another skinning": header(skinning="exec"),
     "another rendering": header(rendering=["exact"]),
-    "a list for a header": lambda arrays: arrays.update(header="[]"),
-    "a deep header": lambda arrays: arrays.update(header="[" * 50_000),
-    "an array for a header": lambda arrays: arrays.update(header=np.zeros(5)),
+    "a list for a header": to(header="[]"),
+    "a deep header": to(header="[" * 50_000),
+    "an array for a header": to(header=np.zeros(5)),
     "a false checksum": header(checksum="0" * 64),
     "a checksum that is a number": header(checksum=7),
-    "no points": lambda arrays: arrays.update(means=np.float32(3)),
+    "no points": to(means=np.float32(3)),
 }
 for kind, change in AVATARS.items():
     item = 3 if "checksum" in kind else 7
-    arrays_case(kind, "avatar", honest_files.avatar_file, change, item)
-arrays_case("without a checksum", "avatar", honest_files.avatar_file, lambda arrays: None, 3, "read")
+    arrays_case(kind, "avatar", honest.avatar_file, change, item)
+arrays_case("without a checksum", "avatar", honest.avatar_file, lambda arrays: None, 3, "read")
 
 
 def body_file():
     with tempfile.TemporaryDirectory() as folder:
-        save_body(Path(folder) / "b.npz", honest_files.tiny_body())
+        save_body(Path(folder) / "b.npz", honest.tiny_body())
         with np.load(Path(folder) / "b.npz") as archive:
             return dict(archive)
 
@@ -91,69 +95,58 @@ BODIES = {
     "NaN in the regressor": put("regressor_values", np.nan),
     "weights of 0": lambda arrays: arrays.update(weight_values=np.zeros_like(arrays["weight_values"])),
     "a circle of parents": put("parents", 1),
-    "10^6 parents": lambda arrays: arrays.update(parents=np.zeros(10**6, np.int16)),
-    "directions of another size": lambda arrays: arrays.update(shape_directions=np.zeros((3, 9, 3), np.int16)),
-    "a number for the template": lambda arrays: arrays.update(template=np.float32(1)),
+    "10^6 parents": to(parents=np.zeros(10**6, np.int16)),
+    "directions of another size": to(shape_directions=np.zeros((3, 9, 3), np.int16)),
+    "a number for the template": to(template=np.float32(1)),
 }
 for kind, change in BODIES.items():
     arrays_case(kind, "body", body_file, change, 7)
 SMPLX = {
     "corners outside": put("f", 99),
     "NaN": put("v_template", np.nan),
-    "objects": lambda arrays: arrays.update(v_template=np.full((9, 3), None)),
+    "objects": to(v_template=np.full((9, 3), None)),
     "another tree": put("kintree_table", 9, (0, 3)),
     "words": cast("weights", str),
-    "no vertices": lambda arrays: arrays.update(v_template=np.zeros((0, 3))),
+    "no vertices": to(v_template=np.zeros((0, 3))),
 }
 for kind, change in SMPLX.items():
-    arrays_case(kind, "smplx npz", honest_files.smplx_arrays, change, 7)
+    arrays_case(kind, "smplx npz", honest.smplx_arrays, change, 7)
 MOTION = {
     "NaN": put("poses", np.nan),
-    "a rate of 0": lambda arrays: arrays.update(mocap_framerate=0.0),
-    "a rate of NaN": lambda arrays: arrays.update(mocap_framerate=np.nan),
-    "a rate of words": lambda arrays: arrays.update(mocap_framerate=np.asarray("fast")),
-    "no frames": lambda arrays: arrays.update(poses=np.zeros((0, 156)), trans=np.zeros((0, 3))),
+    "a rate of 0": to(mocap_framerate=0.0),
+    "a rate of NaN": to(mocap_framerate=np.nan),
+    "a rate of words": to(mocap_framerate=np.asarray("fast")),
+    "no frames": to(poses=np.zeros((0, 156)), trans=np.zeros((0, 3))),
     "complex numbers": cast("poses", complex),
-    "another number of frames": lambda arrays: arrays.update(trans=np.zeros((9, 3))),
+    "another number of frames": to(trans=np.zeros((9, 3))),
 }
+amass = lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}
 for kind, change in MOTION.items():
-    arrays_case(
-        kind,
-        "amass",
-        lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0},
-        change,
-        6,
-    )
-arrays_case(
-    "names that are no list",
-    "joints npz",
-    lambda: {"points": np.zeros((2, 3))},
-    lambda a: a.update(names=np.asarray("x")),
-    6,
-)
+    arrays_case(kind, "amass", amass, change, 6)
+arrays_case("names that are no list", "joints npz", lambda: {"points": np.zeros((2, 3))}, to(names=np.asarray("x")), 6)
 FITS = {
-    "another set": lambda arrays: arrays.update(set=np.asarray("mine")),
+    "another set": to(set=np.asarray("mine")),
     "NaN": put("points", np.nan),
-    "names of numbers": lambda arrays: arrays.update(names=np.zeros(2)),
-    "a shape that does not fit": lambda arrays: arrays.update(points=np.zeros((2, 3, 2))),
-    "one name": lambda arrays: arrays.update(names=np.asarray("x")),
+    "names of numbers": to(names=np.zeros(2)),
+    "a shape that does not fit": to(points=np.zeros((2, 3, 2))),
+    "one name": to(names=np.asarray("x")),
 }
 for kind, change in FITS.items():
-    for reader, arrays in (("fit record", honest_files.fit_arrays), ("keypoints npz", honest_files.keypoint_arrays)):
+    for reader, arrays in (("fit record", honest.fit_arrays), ("keypoints npz", honest.keypoint_arrays)):
         arrays_case(kind, reader, arrays, change, 6, "either" if kind in ("NaN", "names of numbers") else "refused")
 BANKS = {
     "a seed of another split": put("seeds", 10**9),
     "seeds below 0": put("seeds", -5),
-    "another version": lambda arrays: arrays.update(version=np.asarray(99)),
-    "a version of words": lambda arrays: arrays.update(version=np.asarray("x")),
-    "no seeds": lambda arrays: arrays.update(seeds=np.asarray("x")),
+    "another version": to(version=np.asarray(99)),
+    "a version of words": to(version=np.asarray("x")),
+    "no seeds": to(seeds=np.asarray("x")),
     "NaN": put("vertices", np.nan),
     "corners outside": put("faces", 60_000),
-    "another number of people": lambda arrays: arrays.update(betas=np.zeros((9, 3), np.float32)),
+    "another number of people": to(betas=np.zeros((9, 3), np.float32)),
     "complex numbers": cast("texture", complex),
 }
 for kind, change in BANKS.items():
-    arrays_case(kind, "bank", honest_files.bank_arrays, change, 7)
+    arrays_case(kind, "bank", honest.bank_arrays, change, 7)
 
 
 # Numbers that no body has, and what float32 does not hold -------------------------------------------------------------
@@ -166,39 +159,35 @@ for kind, change in {
     "joints a light year away": put("rest_joints", 1e16),
     "weights of 0": lambda arrays: arrays.update(skinning_weights=np.zeros_like(arrays["skinning_weights"])),
     "weights of 1 each": lambda arrays: arrays.update(skinning_weights=np.ones_like(arrays["skinning_weights"])),
-    "no vertices": lambda arrays: arrays.update(
-        rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)
-    ),
-    "no joints": lambda arrays: arrays.update(rest_joints=np.zeros((0, 3), np.float32)),
+    "no vertices": to(rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)),
+    "no joints": to(rest_joints=np.zeros((0, 3), np.float32)),
 }.items():
-    arrays_case(kind, "avatar", honest_files.avatar_file, change)
+    arrays_case(kind, "avatar", honest.avatar_file, change)
 for kind, change in {
     "a template of 1e38": put("template", 1e38),
-    "directions of 1e38": lambda arrays: arrays.update(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
+    "directions of 1e38": to(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
     "a regressor of 1e38": put("regressor_values", 1e38),
 }.items():
     arrays_case(kind, "body", body_file, change)
 for kind, change in {
     "a template of 1e38": put("v_template", 1e38),
-    "directions of 1e300": lambda arrays: arrays.update(shapedirs=np.full((9, 3, 20), 1e300)),
-    "weights of 0": lambda arrays: arrays.update(weights=np.zeros((9, 55))),
+    "directions of 1e300": to(shapedirs=np.full((9, 3, 20), 1e300)),
+    "weights of 0": to(weights=np.zeros((9, 55))),
     "weights of 1e38": put("weights", 1e38),
     "a regressor of 1e38": put("J_regressor", 1e38),
 }.items():
-    arrays_case(kind, "smplx npz", honest_files.smplx_arrays, change)
-own_motion = lambda: {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0}
-amass = lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}
+    arrays_case(kind, "smplx npz", honest.smplx_arrays, change)
 for value in (1e38, 1e300, 1e9):
     for key in ("rotations", "translations"):
-        arrays_case(f"{key} of {value:g}", "motion npz", own_motion, put(key, value))
+        arrays_case(f"{key} of {value:g}", "motion npz", honest.motion_arrays, put(key, value))
     for key in ("poses", "trans"):
         arrays_case(f"{key} of {value:g}", "amass", amass, put(key, value))
 
 
 def capture_of(key, value):
     def make(folder):
-        honest_files.write_capture(folder)
-        arrays = honest_files.body_parameters()
+        honest.write_capture(folder)
+        arrays = honest.body_parameters()
         arrays[key] = np.full(arrays[key].shape, value)
         np.savez(folder / "body.npz", **arrays)
         return folder
@@ -212,28 +201,23 @@ for value in (1e38, 1e300, -1e20, 1e6):
 
 
 for kind, name in {"a title": "\x1b]0;OWNED\x07", "a new line": "a\nb", "half a surrogate": "\ud800"}.items():
-    arrays_case(f"{kind} for a joint", "avatar", honest_files.avatar_file, header(joint_names=["a", "b", name]))
+    arrays_case(f"{kind} for a joint", "avatar", honest.avatar_file, header(joint_names=["a", "b", name]))
 
 
 RATES = {"10^9": 1e9, "10^-9": 1e-9, "10^300": 1e300, "10^-300": 1e-300, "1,001": 1001.0}
 for kind, rate in RATES.items():
     for reader in ("filmed", "motion npz"):
-        arrays_case(
-            f"a rate of {kind}", reader, honest_files.motion_arrays, lambda a, r=rate: a.update(fps=np.asarray(r)), 5
-        )
-arrays_case(
-    "300,000 frames",
-    "filmed",
-    lambda: honest_files.motion_arrays(
-        rotations=np.zeros((300_000, 55, 3), np.float32), translations=np.zeros((300_000, 3), np.float32)
-    ),
-    lambda arrays: None,
-    5,
-)
-arrays_case(
-    "9,000 frames of 100 seconds each",
-    "filmed",
-    lambda: honest_files.motion_arrays(rotations=np.zeros((9000, 55, 3)), translations=np.zeros((9000, 3)), fps=0.01),
-    lambda arrays: None,
-    5,
-)
+        arrays_case(f"a rate of {kind}", reader, honest.motion_arrays, to(fps=np.asarray(rate)), 5)
+MANY = {
+    "300,000 frames": {
+        "rotations": np.zeros((300_000, 55, 3), np.float32),
+        "translations": np.zeros((300_000, 3), np.float32),
+    },
+    "9,000 frames of 100 seconds each": {
+        "rotations": np.zeros((9000, 55, 3)),
+        "translations": np.zeros((9000, 3)),
+        "fps": 0.01,
+    },
+}
+for kind, changes in MANY.items():
+    arrays_case(kind, "filmed", lambda changes=changes: honest.motion_arrays(**changes), lambda arrays: None, 5)

@@ -4,7 +4,7 @@ import os
 import re
 import struct
 
-import honest_files
+import honest_files as honest
 from attacks_photos import EPS, PHOTOS
 from hostile_cases import case, changed, huge, setting, written
 from PIL import Image
@@ -13,7 +13,7 @@ from PIL import Image
 
 
 def glb(change=lambda content: None, **options):
-    return written("scan.glb", lambda: honest_files.textured_glb(change=change, **options))
+    return written("scan.glb", lambda: honest.textured_glb(change=change, **options))
 
 
 def no_view(count):
@@ -85,7 +85,7 @@ def obj_with(texture=None, **options):
     def make(folder):
         if texture is not None:
             (folder / "texture.png").write_bytes(texture)
-        return honest_files.textured_obj(folder, **options)
+        return honest.textured_obj(folder, **options)
 
     return make
 
@@ -101,7 +101,7 @@ short, short_uvs = (
 case("vertices of one number", "obj", changed("obj", short), item=6)
 case("vertices of one number", "thuman scan", changed("thuman scan", short), item=6)
 case("texture coordinates of one number", "thuman scan", changed("thuman scan", short_uvs), "either", 6)
-case("a texture outside", "obj", lambda folder: honest_files.textured_obj(folder, "../../../../etc/passwd"), "read", 2)
+case("a texture outside", "obj", lambda folder: honest.textured_obj(folder, "../../../../etc/passwd"), "read", 2)
 MESHES = {
     "a corner of 2^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 1073741824\n" * 60),
     "a corner of 10^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + f"f 1 2 {10**30}\n" * 60),
@@ -144,13 +144,8 @@ def many_changes(word, count):
 
 
 for word in ("o", "g", "s"):
-    case(
-        f"{word} for each of 30,000 faces",
-        "obj",
-        written("scan.obj", lambda w=word: many_changes(w, 30_000)),
-        "read",
-        5,
-    )
+    many = written("scan.obj", lambda w=word: many_changes(w, 30_000))
+    case(f"{word} for each of 30,000 faces", "obj", many, "read", 5)
 for kind, line in {
     "in comments": "# usemtl a{0}\nf {1}\n",
     "in faces": "f {1} usemtl a{0}\n",
@@ -165,18 +160,12 @@ for kind, line in {
 
     case(f"usemtl {kind}, 30,000", "obj", written("scan.obj", disguised), "either", 5)
 case("usemtl for each of 30,000 faces", "obj", written("scan.obj", lambda: many_changes("usemtl", 30_000)), item=5)
-case(
-    "two materials, 30,000 changes",
-    "obj",
-    written("scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000))),
-    "read",
-    5,
-)
+two = written("scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000)))
+case("two materials, 30,000 changes", "obj", two, "read", 5)
 SOLID = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 {}\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
-case("30,000 solids", "stl", written("scan.stl", lambda: "".join(SOLID.format(i) for i in range(30_000))), item=5)
-case(
-    "30,000 SOLIDS", "stl", written("scan.stl", lambda: "".join(SOLID.format(i) for i in range(30_000)).upper()), item=5
-)
+solids = lambda: "".join(SOLID.format(i) for i in range(30_000))
+case("30,000 solids", "stl", written("scan.stl", solids), item=5)
+case("30,000 SOLIDS", "stl", written("scan.stl", lambda: solids().upper()), item=5)
 
 
 def repeated(count):
@@ -191,7 +180,7 @@ case("1,000 parts with a texture of 9 million pixels", "glb", glb(repeated(1000)
 def obj_with_texture(place, texture="texture.png"):
     def make(folder):
         place(folder / texture)
-        return honest_files.textured_obj(folder, texture)
+        return honest.textured_obj(folder, texture)
 
     return make
 
@@ -202,17 +191,17 @@ TEXTURES = {
     "an endless device": lambda path: path.symlink_to("/dev/zero"),
     "a link to itself": lambda path: path.symlink_to(path),
     "nothing": lambda path: path.touch(),
-    "cut off": lambda path: path.write_bytes(honest_files.photo_bytes()[:200]),
+    "cut off": lambda path: path.write_bytes(honest.photo_bytes()[:200]),
     "a terabyte": huge,
 }
 for kind, place in TEXTURES.items():
     case(f"a texture that is {kind}", "obj", obj_with_texture(place), "read", 6)
-case("a texture without a name", "obj", lambda folder: honest_files.textured_obj(folder, ""), "read", 6)
-case("a texture that is cut off", "glb", glb(images=honest_files.photo_bytes()[:200]), item=6)
+case("a texture without a name", "obj", lambda folder: honest.textured_obj(folder, ""), "read", 6)
+case("a texture that is cut off", "glb", glb(images=honest.photo_bytes()[:200]), item=6)
 
 
 def nine_thousand_textures(folder):
-    path = honest_files.write_obj(folder)
+    path = honest.write_obj(folder)
     (folder / "scan.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd texture.png\n" for i in range(9000)))
     return path
 

@@ -3,7 +3,7 @@
 import json
 import os
 
-import honest_files
+import honest_files as honest
 import numpy as np
 from honest_files import pixels
 from hostile_cases import case
@@ -16,9 +16,9 @@ def capture_that_names(key, value, prepare=lambda folder: None):
     def make(folder):
         inner = folder / "me"
         inner.mkdir()
-        honest_files.write_capture(inner)
+        honest.write_capture(inner)
         prepare(folder)
-        description = honest_files.capture_description()
+        description = honest.capture_description()
         if key == "body":
             description["body"] = value(folder) if callable(value) else value
         else:
@@ -32,7 +32,7 @@ def capture_that_names(key, value, prepare=lambda folder: None):
 def photo_outside(folder):
     Image.fromarray(pixels(12, 10, 3)).save(folder / "outside.png")
     Image.fromarray(pixels(12, 10)).save(folder / "mask.png")
-    np.savez(folder / "outside.npz", **honest_files.body_parameters())
+    np.savez(folder / "outside.npz", **honest.body_parameters())
 
 
 def linked(name, target):
@@ -54,18 +54,10 @@ for way, (named, prepare) in WAYS_OUT.items():
     for key, name in (("image", "outside.png"), ("mask", "mask.png"), ("body", "outside.npz")):
         for reader in ("capture", "photos", "boundary"):
             unread = key == "body" and reader == "photos" and "characters" in way
-            case(
-                f"{key}: {way}",
-                reader,
-                capture_that_names(key, named(name), prepare),
-                "either" if unread else "refused",
-                2,
-            )
-for key, name, target in (
-    ("image", "l.png", "outside.png"),
-    ("mask", "l.png", "mask.png"),
-    ("body", "l.npz", "outside.npz"),
-):
+            expect = "either" if unread else "refused"
+            case(f"{key}: {way}", reader, capture_that_names(key, named(name), prepare), expect, 2)
+LINKS = (("image", "l.png", "outside.png"), ("mask", "l.png", "mask.png"), ("body", "l.npz", "outside.npz"))
+for key, name, target in LINKS:
     for reader in ("capture", "photos", "boundary"):
         case(f"{key}: a link outwards", reader, capture_that_names(key, name, linked(name, target)), item=2)
 for name in ("images/000.png", "capture.json", "", ".", "images"):
@@ -76,11 +68,11 @@ def import_that_names(name, prepare=lambda folder: None):
     def make(folder):
         inner = folder / "in"
         inner.mkdir()
-        honest_files.write_import(inner)
+        honest.write_import(inner)
         photo_outside(folder)
         prepare(inner)
-        frames = [{"file_path": name, "transform_matrix": honest_files.POSE}]
-        (inner / "transforms.json").write_text(json.dumps(honest_files.transforms(frames=frames)))
+        frames = [{"file_path": name, "transform_matrix": honest.POSE}]
+        (inner / "transforms.json").write_text(json.dumps(honest.transforms(frames=frames)))
         return inner / "transforms.json"
 
     return make
@@ -96,9 +88,9 @@ case(
 
 def camera_named(name):
     def make(folder):
-        honest_files.write_import(folder)
+        honest.write_import(folder)
         (folder / "cameras.json").write_text(
-            json.dumps({name: {"K": honest_files.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}})
+            json.dumps({name: {"K": honest.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}})
         )
         return folder / "cameras.json"
 
@@ -116,9 +108,9 @@ def capture_of(count, prepare=lambda folder: None, image="images/000.png", **cha
     """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
 
     def make(folder):
-        honest_files.write_capture(folder)
+        honest.write_capture(folder)
         prepare(folder)
-        description = honest_files.capture_description()
+        description = honest.capture_description()
         view = {**description["views"][0], "frame": 0, **changes}
         del view["mask"]
         description["views"] = [view | {"image": image.format(i)} for i in range(count)]
@@ -168,7 +160,7 @@ for frame in (2_000_000_000, 10**30, 100_000, 1000):
 
 def folders(prepare):
     def make(folder):
-        place = honest_files.write_import_folder(folder)
+        place = honest.write_import_folder(folder)
         prepare(place / "photos")
         return place
 
@@ -178,8 +170,8 @@ def folders(prepare):
 def keypoint_folder(prepare):
     def make(folder):
         (folder / "keypoints").mkdir()
-        for name in honest_files.VIEWS:
-            (folder / "keypoints" / f"{name}_keypoints.json").write_text(honest_files.openpose())
+        for name in honest.VIEWS:
+            (folder / "keypoints" / f"{name}_keypoints.json").write_text(honest.openpose())
         prepare(folder / "keypoints")
         return folder / "keypoints"
 

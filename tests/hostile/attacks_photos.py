@@ -5,7 +5,7 @@ import struct
 import zlib
 from pathlib import Path
 
-import honest_files
+import honest_files as honest
 from attacks_archives import deflated_zeros
 from honest_files import pixels
 from hostile_cases import case, written
@@ -112,7 +112,7 @@ for kind, (data, item) in PHOTOS.items():
 
 def capture_with_photo(data):
     def make(folder):
-        honest_files.write_capture(folder)
+        honest.write_capture(folder)
         (folder / "images" / "000.png").write_bytes(data)
         return folder
 

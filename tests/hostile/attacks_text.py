@@ -3,9 +3,9 @@
 import json
 import re
 
-import honest_files
+import honest_files as honest
 import numpy as np
-from hostile_cases import case, changed, setting, written
+from hostile_cases import case, changed, described, edited, setting, written
 from readers import FORMATS
 
 from humangs_jax.apps.settings import KIND, PRESETS
@@ -32,16 +32,10 @@ DEEP = {
     "a list of nothing": "[]",
     "no keys": "{}",
 }
+FINE = ("null", "a number", "a word", "a list of nothing", "no keys", "half a surrogate")
 for reader, name in JSON_READERS.items():
     for kind, data in DEEP.items():
-        fine = reader == "json" and kind in (
-            "null",
-            "a number",
-            "a word",
-            "a list of nothing",
-            "no keys",
-            "half a surrogate",
-        )
+        fine = reader == "json" and kind in FINE
         expect = "read" if fine or (reader == "configuration" and kind == "no keys") else "refused"
         case(kind, reader, written(name, data), expect, 6)
 for reader in ("json", "openpose", "transforms"):
@@ -63,8 +57,8 @@ YAML = {
     "a matrix of 10^18": "K_a: !!opencv-matrix\n   rows: 1000000000\n   cols: 1000000000\n   dt: d\n   data: [1]",
     "a matrix that is negative": "K_a: !!opencv-matrix\n   rows: -1\n   cols: -1\n   dt: d\n   data: [1]",
     "a matrix of .Inf": "K_a: !!opencv-matrix\n   rows: .Inf\n   cols: 1\n   dt: d\n   data: [1]",
-    "names that are a number": honest_files.opencv_yaml() + "names: 3\n",
-    "names of nobody": honest_files.opencv_yaml() + "names: [x, y]\n",
+    "names that are a number": honest.opencv_yaml() + "names: 3\n",
+    "names of nobody": honest.opencv_yaml() + "names: [x, y]\n",
 }
 for kind, data in YAML.items():
     case(kind, "opencv yaml", written("cameras.yml", "%YAML:1.0\n---\n" + data), item=5 if "digits" not in kind else 6)
@@ -87,26 +81,20 @@ for kind, bad in {
 }.items():
     matrix = [[bad, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     frames = [{"file_path": "a.png", "transform_matrix": matrix}]
-    json_case(f"a matrix with {kind}", "transforms", "transforms.json", honest_files.transforms(frames=frames))
-    json_case(f"a focal length of {kind}", "transforms", "transforms.json", honest_files.transforms(fl_x=bad))
-    json_case(f"a size of {kind}", "transforms", "transforms.json", honest_files.transforms(w=bad))
-    views = honest_files.capture_description()["views"]
+    json_case(f"a matrix with {kind}", "transforms", "transforms.json", honest.transforms(frames=frames))
+    json_case(f"a focal length of {kind}", "transforms", "transforms.json", honest.transforms(fl_x=bad))
+    json_case(f"a size of {kind}", "transforms", "transforms.json", honest.transforms(w=bad))
+    views = honest.capture_description()["views"]
     for key in ("K", "cam_from_world", "frame", "image"):
-        description = honest_files.capture_description(views=[{**views[0], key: bad}, views[1]])
-
-        def make(folder, description=description):
-            honest_files.write_capture(folder)
-            (folder / "capture.json").write_text(json.dumps(description))
-            return folder
-
-        case(f"{key} of {kind}", "capture", make, item=6)
+        changed_views = honest.capture_description(views=[{**views[0], key: bad}, views[1]])
+        case(f"{key} of {kind}", "capture", described(changed_views), item=6)
     person = {"pose_keypoints_2d": [bad] * 75}
     json_case(f"keypoints of {kind}", "openpose", "000_keypoints.json", {"people": [person]})
     json_case(f"keypoints of {kind}", "coco", "a.json", [{"file_name": "000.png", "keypoints": [bad] * 51}])
     json_case(f"a score of {kind}", "mmpose", "a.json", [{"keypoints": [[1, 2]] * 17, "keypoint_scores": [bad] * 17}])
     image = {"id": 1, "file_name": "000.png", "width": bad, "height": bad}
     json_case(f"a size of {kind}", "coco annotations", "a.json", {"images": [image], "annotations": []})
-    json_case(f"a pose of {kind}", "lhm", "a.json", json.loads(honest_files.lhm()) | {"root_pose": [bad] * 3})
+    json_case(f"a pose of {kind}", "lhm", "a.json", json.loads(honest.lhm()) | {"root_pose": [bad] * 3})
     json_case(f"a joint of {kind}", "joints json", "a.json", {"left_hip": [bad, 0, 0]})
 
 COLMAP = {
@@ -123,15 +111,7 @@ COLMAP = {
     "another lens": ("cameras.txt", "PINHOLE", "FISHEYE"),
 }
 for kind, (name, old, new) in COLMAP.items():
-
-    def make(folder, name=name, old=old, new=new):
-        honest_files.write_colmap(folder)
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-        return folder
-
-    case(kind, "colmap", make, "either" if "place" in kind else "refused", 6)
+    case(kind, "colmap", edited("colmap", old, new, name), "either" if "place" in kind else "refused", 6)
 
 
 # Configurations and weights -------------------------------------------------------------------------------------------
@@ -287,37 +267,16 @@ WORDS = {
     "half a surrogate": "\udc9b",
 }
 for kind, word in WORDS.items():
-    views = honest_files.capture_description()["views"]
+    views = honest.capture_description()["views"]
     for key in ("image", "mask"):
-        description = honest_files.capture_description(views=[{**views[0], key: f"images/{word}.png"}, views[1]])
-
-        def make(folder, description=description):
-            honest_files.write_capture(folder)
-            (folder / "capture.json").write_text(json.dumps(description))
-            return folder
-
+        named = honest.capture_description(views=[{**views[0], key: f"images/{word}.png"}, views[1]])
         for reader in ("capture", "photos"):
-            case(f"{kind} in {key}", reader, make)
-
-    def make(folder, word=word):
-        honest_files.write_colmap(folder)
-        text = (folder / "images.txt").read_text()
-        (folder / "images.txt").write_text(
-            text.replace("0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", 1), errors="replace"
-        )
-        return folder
-
-    case(f"{kind} in a name", "colmap", make)
-
-    def make(folder, word=word):
-        path = FORMATS["bvh"].make(folder)
-        text = path.read_text()
-        path.write_text(text.replace("CHANNELS", word, 1), errors="replace")
-        return path
-
-    case(f"{kind} in a word", "bvh", make)
+            case(f"{kind} in {key}", reader, described(named))
+    name = edited("colmap", "0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", "images.txt")
+    case(f"{kind} in a name", "colmap", name)
+    case(f"{kind} in a word", "bvh", edited("bvh", "CHANNELS", word))
     frames = [{"file_path": word, "transform_matrix": [1]}]
-    json_case(f"{kind} in a path", "transforms", "transforms.json", honest_files.transforms(frames=frames))
+    json_case(f"{kind} in a path", "transforms", "transforms.json", honest.transforms(frames=frames))
     json_case(f"{kind} in a name", "coco", "a.json", [{"file_name": word, "keypoints": [1]}])
     json_case(f"{kind} in a key", "joints json", "a.json", {word: [0, 0]})
     json_case(f"{kind} in a field", "configuration", "config.json", {word: 1})
@@ -362,8 +321,8 @@ for key, values in {
 }.items():
     for value in values:
         named = "10^400" if isinstance(value, int) and value > 9 else repr(value)
-        json_case(f"{key} {named}", "manifest", "manifest.json", honest_files.MANIFEST | {key: value})
-without = {key: value for key, value in honest_files.MANIFEST.items() if key != "settings"}
+        json_case(f"{key} {named}", "manifest", "manifest.json", honest.MANIFEST | {key: value})
+without = {key: value for key, value in honest.MANIFEST.items() if key != "settings"}
 json_case("no settings", "manifest", "manifest.json", without)
 
 NOBODY = '{"pose_keypoints_2d":[]}'

@@ -4,10 +4,12 @@
 """
 
 import dataclasses
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
 
+import honest_files as honest
 import numpy as np
 from honest_files import written as written
 from readers import FORMATS
@@ -44,6 +46,31 @@ def setting(path, value):
         content[last] = value
 
     return change
+
+
+def described(description):
+    """A capture with another description."""
+
+    def make(folder):
+        honest.write_capture(folder)
+        (folder / "capture.json").write_text(json.dumps(description))
+        return folder
+
+    return make
+
+
+def edited(name, old, new, inside=None):
+    """The honest file of a reader, or one in its folder, with another text in one place."""
+
+    def make(folder):
+        path = FORMATS[name].make(folder)
+        file = path / inside if inside else path
+        text = file.read_text()
+        assert old in text
+        file.write_text(text.replace(old, new, 1), errors="replace")
+        return path
+
+    return make
 
 
 # Damage to every honest file ------------------------------------------------------------------------------------------

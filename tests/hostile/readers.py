@@ -126,7 +126,7 @@ def continue_preprocessing(folder):
 
 def continue_synthetic_set(path):
     """What `synth` does before it makes anybody."""
-    begin_set(path.parent, SYNTHETIC, {key: MANIFEST[key] for key in ("generator_version", "split", "settings")})
+    begin_set(path.parent, SYNTHETIC, {key: honest.MANIFEST[key] for key in ("generator_version", "split", "settings")})
 
 
 def film(path):

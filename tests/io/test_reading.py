@@ -21,6 +21,7 @@ from humangs_jax.io.reading import (
     Limits,
     Refused,
     check_limit,
+    check_unpacked,
     inside,
     limits,
     parse_json,
@@ -75,6 +76,15 @@ def test_a_limit_is_named_and_can_be_changed(tmp_path):
         parse_json('[{"a": [1]}]')
     with pytest.raises(Refused, match="limit joints is"):
         check_limit("joints", 2000, "joints")
+
+
+def test_a_file_unpacks_to_so_many_times_its_size_or_to_what_any_file_may():
+    """The greater of the two, not their sum; and never beyond the limit of arrays."""
+    set_limits(Limits(plain_bytes=1000, ratio=10, array_bytes=5000))
+    for size, most in ((1, 1000), (100, 1000), (101, 1010), (400, 4000), (600, 5000)):
+        check_unpacked(size, most)
+        with pytest.raises(Refused, match=r"plain_bytes|array_bytes"):
+            check_unpacked(size, most + 1)
 
 
 ZOO = [RecursionError("maximum recursion depth exceeded"), MemoryError(), zipfile.BadZipFile("File is not a zip file")]
