@@ -11,7 +11,7 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +34,10 @@ DIAGONAL_35MM = 43.27
 EXIF_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
 """A file without any of these has no EXIF; looking further would decode a PNG."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_COLOR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
+PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
 """Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
-PALETTE = 3
-"""The color type whose pixels are numbers of a palette."""
-ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
-"""First row, first column and steps of the passes of an interlaced PNG (https://www.w3.org/TR/png-3/#8Interlace)."""
+PALETTE, GREY_AND_ALPHA = 3, 4
+"""Color types: of pixels that are numbers of a palette, and of two channels."""
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
@@ -66,7 +64,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """
     with open_image(path) as (image, data):
         if image.format == "PNG":
-            _checked_chunks(data)
+            _check_chunks(data)
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
             colors = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
             return _mask_of_labels(np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0))))
@@ -288,7 +286,7 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """
     with open_image(path) as (image, data):
         found = image.size, "A" in image.getbands() or "transparency" in image.info
-        _checked_chunks(data) if image.format == "PNG" else image.load()
+        _check_chunks(data) if image.format == "PNG" else image.load()
     return found
 
 
@@ -302,9 +300,9 @@ def _read_pixels(path):
     """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
     with open_image(path) as (image, data):
         if data[:8] == PNG_SIGNATURE:
-            chunks = _checked_chunks(data)
+            _check_chunks(data)
             if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
-                return _decode_deep_png(chunks).astype(np.float32) / np.float32(65535)
+                return _deep_pixels(data).astype(np.float32) / np.float32(65535)
         if image.mode.startswith("I"):  # 16-bit grey
             return np.asarray(image, np.float32)[..., None] / np.float32(65535)
         has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
@@ -312,91 +310,38 @@ def _read_pixels(path):
     return pixels.astype(np.float32) / np.float32(255)
 
 
-# 16 bits a channel: Pillow keeps the upper 8 only -----------------------------------------------------------------------
+# PNG --------------------------------------------------------------------------------------------------------------------
 
 
-BAND = 1024
-"""Rows that are decoded together."""
-
-
-def _decode_deep_png(chunks: list[tuple[bytes, bytes]]) -> UInt[np.ndarray, "h w c"]:
-    """The pixels of a PNG file of 16 bits a channel (https://www.w3.org/TR/png-3/)."""
-    width, height, _, color_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
-    if methods[:2] != [0, 0] or methods[2] > 1 or 0 in (width, height):
+def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
+    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes the lower ones, too."""
+    if data[26:28] != b"\0\0" or data[28] > 1:
         raise Refused("not a readable image: a PNG header with unknown methods")
-    channels = {2: 3, 4: 2, 6: 4}[color_type]
-    passes = ADAM7 if methods[2] else ((0, 0, 1, 1),)
-    sizes = [(len(range(y, height, dy)), len(range(x, width, dx))) for y, x, dy, dx in passes]
-    lengths = [h * (1 + 2 * channels * w) if w else 0 for h, w in sizes]
-    stream = zlib.decompressobj()
-    raw = stream.decompress(b"".join(body for name, body in chunks if name == b"IDAT"), sum(lengths))
-    if len(raw) < sum(lengths):
-        raise EOFError("image file is truncated")
-    pixels, at = np.empty((height, width, channels), np.uint16), 0
-    for (y, x, dy, dx), (h, w), length in zip(passes, sizes, lengths, strict=True):
-        rows = np.frombuffer(raw, np.uint8, length, at)
-        if length:
-            pixels[y::dy, x::dx] = _unfiltered(rows.reshape(h, -1), 2 * channels).view(">u2").reshape(h, w, channels)
-        at += length
-    return pixels
+    if data[25] == GREY_AND_ALPHA:
+        both = _decoded(data, "RGBA")  # the four bytes of a pixel
+        return both[..., 0::2] << 8 | both[..., 1::2]
+    mode = PNG_COLOR_TYPES[data[25]]
+    return _decoded(data, f"{mode};16B") << 8 | _decoded(data, f"{mode};16L")
 
 
-def _checked_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
-    """The chunks of a whole PNG file: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
-    chunks = list(_png_chunks(data))
-    names = {name for name, _ in chunks}
-    if missing := {b"IDAT", b"IEND"} - names:
-        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
-    if data[25] == PALETTE and b"PLTE" not in names:
-        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
-    return chunks
+def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
+    """Bytes of the pixels of a PNG file, chosen by the name that Pillow has for their layout."""
+    with image_in(data) as image:
+        image.tile = [(*tile[:3], raw) for tile in image.tile]
+        return np.asarray(image).astype(np.uint16)
 
 
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Name and contents of each chunk up to the end, checksums compared."""
-    at = 8
-    while at < len(data):
+def _check_chunks(data: bytes) -> None:
+    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
+    at, names = 8, set()
+    while at < len(data) and b"IEND" not in names:
         length, name = struct.unpack(">I4s", data[at : at + 8])
         body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(check) < 4 or zlib.crc32(name + body) != int.from_bytes(check, "big"):
             raise ValueError(f"chunk {name!r} is damaged or cut off")
-        yield name, body
-        if name == b"IEND":
-            return
+        names.add(name)
         at += 12 + length
-
-
-def _unfiltered(rows: np.ndarray, step: int) -> np.ndarray:
-    """The bytes of rows (h, 1 + n) that begin with the number of their filter; `step` bytes are a pixel."""
-    if rows[:, 0].max() > 4:
-        raise ValueError("a filter that does not exist")
-    bands, above = [], np.zeros((rows.shape[1] - 1) // step * step, np.uint8)
-    for start in range(0, len(rows), BAND):
-        bands.append(_unfiltered_band(rows[start : start + BAND], above, step))
-        above = bands[-1][-1]
-    return np.concatenate(bands)
-
-
-def _unfiltered_band(rows: np.ndarray, row_above: np.ndarray, step: int) -> np.ndarray:
-    """A byte depends on those to the left, above, and above to the left: along a diagonal the pixels are independent.
-
-    Pixel x of row y is at [1 + x + y, 1 + y], so that a diagonal is a row in memory; before the first pixel there are zeros.
-    """
-    height, width = len(rows), len(row_above) // step
-    skewed = np.zeros((width + height + 1, height + 1, step), np.int16)
-    y, x = np.arange(height)[:, None], np.arange(width)
-    skewed[1 + x + y, 1 + y] = rows[:, 1:].reshape(height, width, step)
-    skewed[:width, 0] = row_above.reshape(width, step)
-    kinds = rows[:, :1]
-    for diagonal in range(1, width + height):
-        first, last = max(0, diagonal - width), min(height, diagonal)
-        here, kind = slice(1 + first, 1 + last), kinds[first:last]
-        left, above = skewed[diagonal - 1, here], skewed[diagonal - 1, first:last]
-        corner = skewed[diagonal - 2, first:last]
-        near = left + above - corner
-        a, b, c = (np.abs(near - each) for each in (left, above, corner))
-        paeth = np.where((a <= b) & (a <= c), left, np.where(b <= c, above, corner))
-        guess = np.select([kind == 1, kind == 2, kind == 3, kind == 4], [left, above, (left + above) >> 1, paeth], 0)
-        skewed[diagonal, here] += guess
-        skewed[diagonal, here] &= 255
-    return skewed[1 + x + y, 1 + y].astype(np.uint8).reshape(height, -1)
+    if missing := {b"IDAT", b"IEND"} - names:
+        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
+    if data[25] == PALETTE and b"PLTE" not in names:
+        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")

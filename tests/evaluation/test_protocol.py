@@ -1,12 +1,14 @@
 """Crops and backgrounds of the protocols against other implementations, on random images and masks."""
 
 import dataclasses
+import typing
 
 import numpy as np
 import pytest
 from evaluation_cases import ellipse
 from scipy import ndimage
 
+from humangs_jax.cli.evaluate import Evaluate
 from humangs_jax.evaluation.protocol import (
     PROTOCOLS,
     CentredWindow,
@@ -52,6 +54,7 @@ def test_the_presets_are_those_of_the_table():
     assert find_protocol(own) is own and find_protocol("lhm") is PROTOCOLS["lhm"]
     with pytest.raises(ValueError, match=r"'lmh': expected one of humangs, animatable-gaussians"):
         find_protocol("lmh")
+    assert typing.get_args(typing.get_type_hints(Evaluate)["protocol"]) == tuple(PROTOCOLS)
     with pytest.raises(dataclasses.FrozenInstanceError):
         own.masked = True  # ty: ignore[invalid-assignment]
 

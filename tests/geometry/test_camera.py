@@ -54,7 +54,7 @@ def test_resizing_and_units_keep_the_image():
     uv, depth = cameras.project(c, point)
     other, _ = cameras.project(c.resized(64, 24), point)  # each axis by its own factor
     scaled, scaled_depth = cameras.project(c.in_units(0.5), point / 0.5)
-    assert np.allclose(other, uv * [2, 0.75], atol=1e-3)
+    assert np.allclose(other, np.asarray(uv) * [2, 0.75], atol=1e-3)
     assert np.allclose(scaled, uv, atol=1e-3) and np.isclose(scaled_depth, depth / 0.5, atol=ATOL)
 
 
