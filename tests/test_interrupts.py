@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.fitting.your_photos import landmarks_in, write_material
+from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.cli.screen import PATIENCE
 from humangs_jax.data.capture import load_capture, save_capture

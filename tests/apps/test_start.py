@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.fitting.your_photos import landmarks_in, write_material
+from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.apps import detect, photos_alone
 from humangs_jax.apps.detect import Found, PhotoPeople

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.fitting.your_photos import in_a_room
+from experiments.your_photos import in_a_room
 from humangs_jax import cli
 from humangs_jax.apps import detect
 from humangs_jax.avatar.video import write_video

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.data import made_up
-from experiments.fitting.your_photos import landmarks_in
+from experiments.your_photos import landmarks_in
 from humangs_jax import cli
 from humangs_jax.apps.check import check_capture
 from humangs_jax.avatar.animate import animate

@@ -1,54 +1,56 @@
-"""The figures of docs/your_photos.md: a folder as a photographer has it, made of a synthetic person, and what comes of it.
+"""A folder of photos as a photographer has it, made of a synthetic person, and what comes of it."""
 
-    python experiments/fitting/your_photos.py --out OUT --docs
-
-OUT/photos is the folder: images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2 pixels of
-noise). `humangs start` makes OUT/me of it. About two minutes, most of them compilation.
-"""
-
-import argparse
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
+import jax.numpy as jnp
 import numpy as np
+from PIL import Image, ImageDraw
 
-IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+from experiments.harness import Run, entry
+from humangs_jax import cli
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import images, rest_pose_of, turntable_views
+from humangs_jax.avatar.sheets import tile
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.body.library import load_body
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.io.images import read_image, write_png
+from humangs_jax.io.reading import write_json
+from humangs_jax.people.writer import Layout, write_person
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 SEED, VIEWS, SIZE, NOISE = 4_000_002, 4, 512, 2.0
 OPENCV_FROM_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 WIDTH = 1200
 """Pixels of a figure."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="a new folder")
-    parser.add_argument("--docs", action="store_true", help="write the figures into docs/images")
-    arguments = parser.parse_args()
-    from humangs_jax import cli
-    from humangs_jax.body.library import load_body
-    from humangs_jax.data.capture import load_capture
-    from humangs_jax.people.writer import Layout, write_person
+@entry
+def your_photos(run: Run, out: Path, docs: bool = False) -> int:
+    """The figures of docs/your_photos.md: OUT/photos as a photographer has it, and what `humangs start` makes of it, OUT/me.
 
-    arguments.out.mkdir(parents=True)
-    write_person(arguments.out / "truth", SEED, load_body(), Layout(SIZE, views=VIEWS, held_out_views=8))
-    truth, photos, me = load_capture(arguments.out / "truth"), arguments.out / "photos", arguments.out / "me"
+    Images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2 pixels of noise). Two minutes.
+
+    Options:
+    out: a new folder
+    docs: write the figures into docs/images
+    """
+    out.mkdir(parents=True)
+    write_person(out / "truth", SEED, load_body(), Layout(SIZE, views=VIEWS, held_out_views=8))
+    truth, photos, me = load_capture(out / "truth"), out / "photos", out / "me"
     points = landmarks_in(truth)
     points = points + np.random.default_rng(0).normal(0, NOISE, points.shape)
     write_material(photos, truth, points)
     code = cli.execute(["start", str(photos), "--out", str(me), "--refine", "15s", "--no-browser"])
-    if code or not arguments.docs:
-        sys.exit(code)
-    draw_figures(arguments.out, points)
+    if not code and docs:
+        draw_figures(out, points)
+    return code
 
 
 def write_material(folder: Path, capture, points: np.ndarray) -> None:
     """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write them."""
-    from humangs_jax.io.images import write_png
-    from humangs_jax.io.reading import write_json
-
     for name in ("images", "masks", "keypoints"):
         (folder / name).mkdir(parents=True)
     calibration = {}
@@ -74,11 +76,6 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
 
 def landmarks_in(capture, names: tuple[str, ...] | None = None) -> np.ndarray:
     """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have. Default: COCO-WholeBody's."""
-    import jax.numpy as jnp
-
-    from humangs_jax.body.landmarks import landmark_model, pose_landmarks
-    from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
-
     model, betas = landmark_model(capture.body, names or COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
     points = []
     for i, frame in enumerate(capture.frames):
@@ -100,12 +97,6 @@ def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def draw_figures(out: Path, points: np.ndarray) -> None:
     """docs/images/your_photos_*.jpg."""
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.frames import images, rest_pose_of, turntable_views
-    from humangs_jax.avatar.sheets import tile
-    from humangs_jax.avatar.shot import Shot
-    from humangs_jax.io.images import read_image
-
     read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
     photos, masks = (np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks"))
     marked = np.stack([with_points(photo, own) for photo, own in zip(photos, points, strict=True)])
@@ -120,8 +111,6 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
 
 def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
     """A photo with a dot for each keypoint."""
-    from PIL import Image, ImageDraw
-
     image = Image.fromarray((255 * photo).round().astype(np.uint8))
     pen = ImageDraw.Draw(image)
     for x, y in points[np.isfinite(points).all(-1)]:
@@ -131,12 +120,6 @@ def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def save(image: np.ndarray, path: Path) -> None:
     """A JPEG of at most `WIDTH` pixels."""
-    from PIL import Image
-
     picture = Image.fromarray((255 * np.clip(image[..., :3], 0, 1)).round().astype(np.uint8))
     picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
     picture.save(path, quality=88)
-
-
-if __name__ == "__main__":
-    main()

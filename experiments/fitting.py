@@ -1,0 +1,364 @@
+"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known, detections with errors."""
+
+import dataclasses
+import functools
+import time
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry, figure
+from experiments.results import markdown_table
+from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
+from humangs_jax.data.motion import load_motion
+from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
+from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
+from humangs_jax.fitting.triangulation import triangulate, triangulate_robustly
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.people.cameras import cameras_around, spread_azimuths
+from humangs_jax.people.poses import sample_rotations
+from humangs_jax.people.subject import make_subject
+
+POSE_STREAM, CAMERA_STREAM, ERROR_STREAM = 21, 22, 23
+
+
+@dataclasses.dataclass(frozen=True)
+class FitCase:
+    """One person in m frames seen by c cameras. betas (s,), rotations (m, j, 3), translations (m, 3), joints (m, j, 3),
+    landmarks (m, k, 3) are true; K (m, c, 3, 3) and cam_from_world (m, c, 4, 4).
+    """
+
+    betas: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+    joints: np.ndarray
+    landmarks: np.ndarray
+    K: np.ndarray
+    cam_from_world: np.ndarray
+
+
+def make_case(seed, body, model, frames, views, size=512) -> FitCase:
+    """The person of a seed in random poses, each with cameras of its own, as of the published protocol."""
+    subject = make_subject(seed, body)
+    rotations, translations, extrinsics, intrinsics = [], [], [], []
+    for frame in range(frames):
+        rng = np.random.default_rng([seed, POSE_STREAM, frame])
+        pose = sample_rotations(rng, subject.build)
+        pose[0] = [0, rng.uniform(-np.pi, np.pi), 0]
+        vertices = subject.posed_vertices(pose, np.zeros(3))
+        shift = rng.uniform([-1, 0, -1], [1, 0, 1]) - [0, vertices[:, 1].min(), 0]
+        rng = np.random.default_rng([seed, CAMERA_STREAM, frame])
+        cameras = cameras_around(rng, vertices + shift, spread_azimuths(rng, views), size)
+        rotations.append(pose)
+        translations.append(shift)
+        extrinsics.append(np.asarray(cameras.cam_from_world))
+        intrinsics.append(np.asarray(cameras.K))
+    rotations, translations = np.asarray(rotations, np.float32), np.asarray(translations, np.float32)
+    pose_all = jax.jit(jax.vmap(lambda r, t: pose_landmarks(model, jnp.asarray(subject.betas), BodyPose(r, t))))
+    landmarks, joints = pose_all(rotations, translations)
+    return FitCase(
+        subject.betas,
+        rotations,
+        translations,
+        np.asarray(joints),
+        np.asarray(landmarks),
+        np.stack(intrinsics),
+        np.stack(extrinsics),
+    )
+
+
+def walking(seeds, kind, frames, views, size=512):
+    """The landmark model of a keypoint set, and people of these seeds in the first frames of the shipped walk.
+
+    Cameras stand still all around.
+    """
+    body, motion = load_body(), load_motion()
+    model = landmark_model(body, KEYPOINT_SETS[kind].names)
+    rotations, translations = (np.asarray(x)[:frames] for x in (motion.rotations, motion.translations))
+    pose_all = jax.jit(jax.vmap(lambda betas, r, t: pose_landmarks(model, betas, BodyPose(r, t)), (None, 0, 0)))
+    K = intrinsics_from_fov(1.0, size, size)
+    people = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, POSE_STREAM])
+        betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
+        landmarks, joints = (np.asarray(x) for x in pose_all(betas, rotations, translations))
+        azimuths = rng.uniform(0, 2 * np.pi) + np.arange(views) * (2 * np.pi / views)
+        cameras = orbit(jnp.asarray(joints.mean((0, 1))), 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, size, size)
+        still = lambda array: np.broadcast_to(np.asarray(array), (frames, *array.shape))
+        matrices = still(cameras.K), still(cameras.cam_from_world)
+        people.append(FitCase(betas, rotations, translations, joints, landmarks, *matrices))
+    return model, people
+
+
+def detect(case, seed, noise_px, outliers, outlier_px=100.0):
+    """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share displaced by up to so far."""
+    rng = np.random.default_rng([seed, ERROR_STREAM])
+    seen = (
+        np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks)
+        + case.cam_from_world[..., None, :3, 3]
+    )
+    pixels = seen[..., :2] / seen[..., 2:] * case.K[..., None, [0, 1], [0, 1]] + case.K[..., None, :2, 2]
+    pixels = pixels + rng.normal(0, 1, pixels.shape) * noise_px
+    wild = rng.random(pixels.shape[:-1]) < outliers
+    angle, radius = rng.uniform(0, 2 * np.pi, wild.shape), outlier_px * np.sqrt(rng.random(wild.shape))
+    return pixels + (wild * radius)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def observe(people, seed, noise_px, outliers, model):
+    """Observations (people, m, c, ...) of cases, with the errors of a detector."""
+    points = np.stack([detect(case, seed + i, noise_px, outliers) for i, case in enumerate(people)])
+    confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
+    noise = np.stack([expected_noise(p, c) for p, c in zip(points, confidences, strict=True)])
+    K, cam_from_world = (np.stack([getattr(case, name) for case in people]) for name in ("K", "cam_from_world"))
+    arrays = (points, confidences, K, cam_from_world, noise)
+    return jax.vmap(jax.vmap(Observations))(*(jnp.asarray(x, jnp.float32) for x in arrays))
+
+
+VIEWS, NOISES = (1, 2, 3, 4, 8), (0.0, 1.0, 2.0, 5.0, 10.0)
+ALL = "wholebody133"
+FIRST = 4_000_000
+
+
+@entry
+def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = True, plot: Path | None = None) -> None:
+    """How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random poses, errors of a detector.
+
+    Errors over views, over noise and over keypoint sets: of all 55 joints in the world, of the body's 22 and of the hands',
+    beside plain and robust triangulation of the same keypoints; seconds per frame of all people and frames in one batch,
+    compilation apart. 8 minutes on two cores.
+
+    Options:
+    people: of the fitting seeds
+    frames: of each person
+    curves: over views, noise and sets; without, four views of COCO-WholeBody alone
+    plot: picture of the curves (.png)
+    """
+    if min(people, frames) < 1:
+        raise ValueError("--people and --frames: expected at least 1")
+    parts = {"alone": [(ALL, 4, 2.0, share) for share in (0.2, 0.0)]}
+    if curves:
+        parts["over_views"] = [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
+        parts["over_noise"] = [(ALL, 4, noise, 0.0) for noise in NOISES]
+        parts["over_sets"] = [(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)]
+    body, made = load_body(), functools.cache(_people)
+    settings = {
+        each: f"{each[0]}, {each[1]} views, {each[2]:g} px, {each[3]:.0%}" for part in parts.values() for each in part
+    }
+    cases = {name: functools.partial(_errors, made, body, people, frames, each) for each, name in settings.items()}
+    rows = run.rows(cases, {"people": people, "frames": frames})
+    table = []
+    for (kind, views, noise, share), name in settings.items():
+        shown = ["-" if rows[name].get(key) is None else f"{rows[name][key]:.1f}" for key in COLUMNS]
+        table.append([kind, views, f"{noise:g}", f"{share:.0%}", *shown])
+    four = rows[settings[(ALL, 4, 2.0, 0.2)]]
+    said = (
+        f"{people} people of {frames} frames each in one batch: {four['seconds_per_frame']:.2f} s a frame with four views, "
+        f"after a first call of {four['first_call_s']:.0f} s that compiles."
+    )
+    if curves:
+        alone = rows[settings[(ALL, 1, 2.0, 0.0)]]["root_aligned_mean_joint_error_mm"]
+        said += f" With one view and the pelvis put in its place the mean is {alone:.0f} mm."
+    header = ["keypoints", "views", "noise, px", "outliers", *COLUMNS.values()]
+    run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
+    if plot:
+        plot_keypoints(plot, {part: [(each, rows[settings[each]]) for each in parts[part]] for part in parts})
+
+
+@functools.cache
+def _model(kind):
+    return landmark_model(load_body(), KEYPOINT_SETS[kind].names)
+
+
+def _people(kind, views, count, frames):
+    body = load_body()
+    return [make_case(FIRST + i, body, _model(kind), frames, views) for i in range(count)]
+
+
+def _errors(made, body, count, frames, setting):
+    """Millimetres, and seconds."""
+    kind, views, noise, outliers = setting
+    model, people = _model(kind), made(kind, views, count, frames)
+    seen = observe(people, FIRST, noise, outliers, model)
+    fit_all = jax.vmap(lambda own: fit_landmarks(model, own, FitConfig()))
+    times = [time.perf_counter()]
+    for _ in range(2):
+        fit = jax.block_until_ready(fit_all(seen))
+        times.append(time.perf_counter())
+    truth = np.stack([case.joints for case in people])
+    errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1)
+    found = joint_errors(errors) | landmark_errors(model, people, seen, fit)
+    found["root_aligned_mean_joint_error_mm"] = root_aligned(np.asarray(fit.joints), truth)
+    return found | {"seconds_per_frame": (times[2] - times[1]) / (count * frames), "first_call_s": times[1] - times[0]}
+
+
+def plot_keypoints(path: Path, parts: dict) -> None:
+    """Error over views and over noise, fit beside triangulation."""
+    over = parts["over_views"]
+    panels = [
+        ([(each[1], row) for each, row in over if not each[3]], "views", "2 px of noise"),
+        ([(each[1], row) for each, row in over if each[3]], "views", "2 px of noise, 20 % outliers"),
+        ([(each[2], row) for each, row in parts["over_noise"]], "noise, pixels of 512", "4 views"),
+    ]
+    lines = {
+        "triangulated_mm": ("plain triangulation", "tab:gray"),
+        "robustly_triangulated_mm": ("robust triangulation", "tab:orange"),
+        "mean_landmark_error_mm": ("fit", "tab:blue"),
+    }
+    with figure(path, 3, (13, 4)) as axes:
+        for axis, (rows, label, title) in zip(axes, panels, strict=True):
+            for name, (line, color) in lines.items():
+                points = [(x, row[name]) for x, row in rows if row.get(name) is not None]
+                axis.plot(*zip(*points, strict=True), "o-", label=line, color=color)
+            axis.set(xlabel=label, ylabel="landmarks, mean mm", title=title)
+            axis.set_yscale("log" if label == "views" else "symlog")
+        axes[0].legend()
+
+
+def joint_errors(errors) -> dict:
+    """Of errors (people, m, j), millimetres."""
+    return {
+        "mean_joint_error_mm": float(errors.mean()),
+        "p95_joint_error_mm": float(np.quantile(errors, 0.95)),
+        "mean_body_joint_error_mm": float(errors[..., :22].mean()),
+        "mean_hand_joint_error_mm": float(errors[..., 25:].mean()),
+        "worst_frame_mean_mm": float(errors.mean(-1).max()),
+    }
+
+
+def root_aligned(joints, truth) -> float:
+    """Mean error, millimetres, with the pelvis of each where the true one is: what a single view can know."""
+    moved = joints - joints[..., :1, :] + truth[..., :1, :]
+    return float(1000 * np.linalg.norm(moved - truth, axis=-1).mean())
+
+
+def landmark_errors(model, people, seen, fit) -> dict:
+    """Millimetres between true landmarks and fitted or triangulated ones; None of triangulation from one view."""
+    truth, known = np.stack([case.landmarks for case in people]), np.asarray(model.known)
+    off = lambda points: float(1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean())
+    found = {"mean_landmark_error_mm": off(fit.landmarks)}
+    if seen.points.shape[2] > 1:
+        plain, robust = (jax.jit(jax.vmap(jax.vmap(f))) for f in (triangulate, triangulate_robustly))
+        found |= {"triangulated_mm": off(plain(seen)[0]), "robustly_triangulated_mm": off(robust(seen)[0])}
+    return found
+
+
+COLUMNS = {
+    "mean_joint_error_mm": "joints, mean mm",
+    "p95_joint_error_mm": "95 %",
+    "mean_body_joint_error_mm": "body",
+    "mean_hand_joint_error_mm": "hands",
+    "mean_landmark_error_mm": "landmarks: fit",
+    "triangulated_mm": "triangulated",
+    "robustly_triangulated_mm": "robustly",
+}
+
+
+FRAMES, OTHER = 7, (0.8, 0.0, 0.5)
+"""Frames of the walk, and how far from the person somebody else stands, metres."""
+CASES = {
+    "all frames seen": (4, 1.0, ()),
+    "frame 3 without keypoints": (4, 1.0, (3,)),
+    "the last frame without keypoints": (4, 1.0, (6,)),
+    "frames 2 to 4 without keypoints": (4, 1.0, (2, 3, 4)),
+    "frame 3 seen by one view": (4, 1.0, (3,)),
+    "frame 3 is somebody else": (4, 1.0, (3,)),
+    "a fifth of frame 3 up to 100 px off": (4, 1.0, (3,)),
+    "one camera": (1, 1.0, ()),
+    "one camera, frame 3 without keypoints": (1, 1.0, (3,)),
+    "4 px of noise": (4, 4.0, ()),
+}
+"""Views, noise of the detections in pixels of 512, and which frames are spoilt."""
+
+
+@entry
+def fit_sequences(
+    run: Run,
+    smoothness: tuple[float, ...] = (0.005, 0.02),
+    people: int = 3,
+    kind: Literal["coco17", "wholebody133"] = "wholebody133",
+    cases: tuple[str, ...] = (),
+) -> None:
+    """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the shipped walk with known keypoints.
+
+    Mean error over all 55 joints of the frames that the case leaves alone and of those that it spoils, and of the joints'
+    accelerations where no frame is spoilt (how much they tremble), with frames fitted one by one and with smooth motion. 15
+    minutes.
+
+    Options:
+    smoothness: expected acceleration, metres per frame squared
+    people: of the fitting seeds
+    kind: which keypoints
+    cases: names; default: all
+    """
+    model, made = walking(range(FIRST, FIRST + people), kind, FRAMES, 4)
+    ways = {"alone": 0.0} | {f"smooth {s:g}": s for s in smoothness}
+    names = cases or tuple(CASES)
+    each = {
+        f"{name}: {way}": functools.partial(measure, model, made, name, s) for name in names for way, s in ways.items()
+    }
+    rows = run.rows(each, {"people": people, "kind": kind})
+    show = lambda value: "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
+    keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
+    table = [[name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)] for name in names]
+    header = ["case"]
+    for what in keys.values():
+        header += [f"{what}: one by one", *(f"{s:g}" for s in smoothness)]
+    said = (
+        f"{people} people, {FRAMES} frames, {kind}, one by one and with these values of `--smoothness`; mean "
+        f"errors in millimetres, and millimetres per frame squared."
+    )
+    run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
+
+
+def measure(model, people, name: str, smoothness: float) -> dict:
+    """Mean errors of the frames left alone, of the spoilt ones and of accelerations, millimetres; the acceleration held to."""
+    _, _, spoilt = CASES[name]
+    seen = spoiled(model, people, name)
+    config = FitConfig(smoothness=smoothness)
+    fit = jax.vmap(lambda own: fit_landmarks(model, own, config))(seen)
+    truth = np.stack([case.joints for case in people])
+    errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1).mean(-1)
+    bad = np.isin(np.arange(FRAMES), spoilt)
+    wild = 1000 * np.linalg.norm(np.diff(np.asarray(fit.joints) - truth, 2, axis=1), axis=-1)
+    return {
+        "others_mm": float(errors[:, ~bad].mean()),
+        "spoilt_mm": float(errors[:, bad].mean()) if bad.any() else None,
+        "worst_frame_mm": float(errors[:, ~bad].max()),
+        "tremble_mm": None if bad.any() else float(wild.mean()),
+        "held_to": [float(x) for x in fit.smoothness] if smoothness else None,
+    }
+
+
+def spoiled(model, people, name: str):
+    """Observations (people, m, c, ...) of a case."""
+    views, noise, spoilt = CASES[name]
+    seen = observe(people, FIRST, noise, 0.0, model)
+    points, confidences = np.array(seen.points), np.array(seen.confidences)
+    rows = list(spoilt)
+    if "without" in name:
+        confidences[:, rows] = 0
+    elif "one view" in name:
+        confidences[:, rows, 1:] = 0
+    elif "somebody else" in name:
+        others = observe([moved(case, OTHER) for case in people[1:] + people[:1]], FIRST + 1, noise, 0.0, model)
+        points[:, rows] = np.asarray(others.points)[:, [(row + FRAMES // 2) % FRAMES for row in rows]]
+    elif "px off" in name:
+        points[:, rows] = np.asarray(observe(people, FIRST, noise, 0.2, model).points)[:, rows]
+    noises = np.stack(
+        [expected_noise(p, c) for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)]
+    )
+    each = {"points": points, "confidences": confidences, "K": seen.K, "cam_from_world": seen.cam_from_world}
+    return replace(seen, **{key: value[:, :, :views] for key, value in each.items()}, noise=noises)
+
+
+def moved(case, by):
+    """The case with the person elsewhere."""
+    by = np.asarray(by, np.float32)
+    return dataclasses.replace(case, joints=case.joints + by, landmarks=case.landmarks + by)
