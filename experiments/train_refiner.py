@@ -2,8 +2,8 @@
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
 ten views, four of them those photos. A step draws samples and a number of photos for each, runs the iterations, and compares the
-result of each round with views that are not among the photos. Gradients pass through the iterations, but not through the errors
-that a round sees. Validation is on other people.
+result of each iteration with views that are not among the photos. Gradients pass through the iterations, but not through the errors
+that an iteration sees. Validation is on other people.
 """
 
 import dataclasses
@@ -47,13 +47,13 @@ from humangs_jax.refinement.learned import (
     graph_of,
     photo_signals,
     read_refiner,
-    refiner_round,
+    refiner_iteration,
     save_refiner,
     stacked,
     unstacked,
 )
-from humangs_jax.refinement.objective import Photos, posed_gaussians
-from humangs_jax.refinement.parameters import parameters_of
+from humangs_jax.refinement.objective import parameters_of, posed_gaussians
+from humangs_jax.refinement.photos import Photo
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import plan_buffers, render
 
@@ -151,7 +151,7 @@ def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A start and the views of its person, the photos first, as `Photos` of one view each."""
+    """A start and the views of its person, the photos first, as a `Photo` each."""
 
     avatar: Any
     start: Any
@@ -164,16 +164,9 @@ def read_sample(folder: Path) -> Sample:
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     count = len(images)
-    photos = Photos(
-        images=images,
-        masks=masks,
-        counted=jnp.ones(masks.shape, bool),
-        cameras=Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), SIZE, SIZE),
-        rotations=jnp.asarray(arrays["rotations"]),
-        translations=jnp.asarray(arrays["translations"]),
-        index=jnp.zeros(count, int),
-    )
-    views = [jax.tree.map(lambda x, i=i: x[i], photos) for i in range(count)]
+    cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), SIZE, SIZE)
+    pose = jnp.asarray(arrays["rotations"]), jnp.asarray(arrays["translations"])
+    views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose, jnp.zeros(count, int)))
     start = parameters_of(avatar.gaussians, 1, len(avatar.parents))
     return Sample(avatar, start, views, graph_of(np.asarray(avatar.gaussians.means)))
 
@@ -191,7 +184,7 @@ def compiled(function: Any) -> Any:
 def run_iterations(
     variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
 ) -> tuple[list[Any], list[Any]]:
-    """Parameters side by side after each round, and the signals that each round saw."""
+    """Parameters side by side after each iteration, and the signals that each iteration saw."""
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(iterations):
@@ -200,7 +193,7 @@ def run_iterations(
             compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]
         ]
         seen.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
-        values, hidden = compiled(refiner_round)(
+        values, hidden = compiled(refiner_iteration)(
             variables, values, start, hidden, seen[-1], sample.graph, sample.avatar
         )
         after.append(values)
@@ -208,12 +201,12 @@ def run_iterations(
 
 
 def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
-    """Gradient with respect to the variables, from those with respect to the parameters after each round."""
+    """Gradient with respect to the variables, from those with respect to the parameters after each iteration."""
 
     def iterations(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
         for signals in seen:
-            values, hidden = refiner_round(variables, values, start, hidden, signals, graph, avatar)
+            values, hidden = refiner_iteration(variables, values, start, hidden, signals, graph, avatar)
             after.append(values)
         return after
 
@@ -222,16 +215,16 @@ def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, 
 
 def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tuple[Any, Any]:
     """Loss of one view, relative to the person's share of the image; mean squared error."""
-    drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.cameras, splat)
+    drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.camera, splat)
     terms = {
-        "squared": jnp.square(drawn.rgb - view.images),
-        "absolute": jnp.abs(drawn.rgb - view.images),
-        "structural": structural_dissimilarity(drawn.rgb, view.images),
-        "silhouette": jnp.abs(drawn.alpha - view.masks),
+        "squared": jnp.square(drawn.rgb - view.image),
+        "absolute": jnp.abs(drawn.rgb - view.image),
+        "structural": structural_dissimilarity(drawn.rgb, view.image),
+        "silhouette": jnp.abs(drawn.alpha - view.mask),
     }
     loss = sum(weight * jnp.mean(terms[name]) for name, weight in WEIGHTS.items())
-    squared = jnp.mean(jnp.square(jnp.clip(drawn.rgb, 0, 1) - view.images))
-    return 0.15 * loss / jnp.mean(view.masks), squared
+    squared = jnp.mean(jnp.square(jnp.clip(drawn.rgb, 0, 1) - view.image))
+    return 0.15 * loss / jnp.mean(view.mask), squared
 
 
 @functools.cache
@@ -242,7 +235,7 @@ def view_gradient() -> Any:
 
 
 def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -> list[float]:
-    """PSNR of views that are not among the photos, mean over samples, before and after each round."""
+    """PSNR of views that are not among the photos, mean over samples, before and after each iteration."""
     rows = []
     for folder in folders:
         sample = read_sample(folder)
@@ -256,7 +249,7 @@ def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -
 
 
 def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: Any, seed: tuple[int, int]) -> Any:
-    """Gradient of one sample, which the seed chooses: a new view for each round, two for the last one."""
+    """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the last one."""
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
     photos = int(rng.choice(COUNTS))
@@ -311,7 +304,7 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
             while (step := int(state["step"])) < options.steps:
                 if step % VALIDATE_EVERY == 0:
                     dB = validate(state["variables"], validation, options.iterations, splat)
-                    bar.write(f"step {step}: {dB} dB before and after each round")
+                    bar.write(f"step {step}: {dB} dB before and after each iteration")
                 one = functools.partial(step_gradient, state["variables"], folders, options.iterations, splat)
                 gradients = list(threads.map(one, [(step, i) for i in range(options.batch)]))
                 gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
@@ -325,7 +318,7 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
     write_bytes(path, serialization.to_bytes(jax.device_get(state)))
     if int(state["step"]) == options.steps:
         dB = validate(state["variables"], validation, options.iterations, splat)
-        print(f"step {options.steps}: {dB} dB before and after each round")
+        print(f"step {options.steps}: {dB} dB before and after each iteration")
         save_refiner(out / "refiner.safetensors", state["variables"])
 
 
@@ -333,7 +326,7 @@ def planned(samples: list[Sample]) -> Any:
     """Buffers that have room for every view of these samples."""
     like = SPLAT_PRESETS[samples[0].avatar.rendering]
     plans = [
-        plan_buffers(posed_gaussians(sample.start, sample.avatar, view, poses=False), view.cameras, like, MARGIN)
+        plan_buffers(posed_gaussians(sample.start, sample.avatar, view, poses=False), view.camera, like, MARGIN)
         for sample in samples
         for view in sample.views
     ]

@@ -1,7 +1,7 @@
 """Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it back."""
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Literal
 
 from humangs_jax.core.configuration import (
     Few,
@@ -27,65 +27,60 @@ ITERATIONS = 4
 class LearningRates:
     """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine
     and, after iterations, in long runs (`RefineConfig.full_steps`).
-
-    means: metres, in the T-pose. quats: of quaternions that start at unit length. log_scales, opacity_logits, color_logits: no
-    unit. rotations: radians of the pose's axis-angles, translations: metres; both only with `RefineConfig.poses`.
     """
 
     means: Spread = 2e-4
+    """Metres, in the T-pose."""
     quats: Spread = 2e-3
+    """Of quaternions that start at unit length."""
     log_scales: Spread = 1e-2
     opacity_logits: Spread = 3e-2
     color_logits: Spread = 4e-2
     rotations: Spread = 1e-3
+    """Radians of the pose's axis-angles; only with `RefineConfig.poses`."""
     translations: Spread = 2e-4
+    """Metres, of the pose; only with `RefineConfig.poses`."""
 
 
 @configuration
 class RefineConfig:
-    """How `refine` fits an avatar to its photos.
-
-    iterations: of the learned update (see `learned.py`), before the first step. 0: none.
-
-    steps, seconds: limits of the run; the smaller number of steps counts. None: no limit. Compilation does not count. 0 steps:
-    iterations alone, which are always finished. seconds become a number of steps before the first step, by the time that a few
-    take; that number, `Refinement.planned`, repeats the run exactly.
-    image_size: photos whose longer side is larger are reduced to it, pixels; None: photos as they are. views_per_step: photos
-    drawn in a step.
-
-    structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colors.
-    rates: see `LearningRates`. full_steps: after iterations, a run of more
-    steps than this takes smaller ones in proportion; Gaussians that move further overfit to the photos.
-
-    visible: a Gaussian whose
-    largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
-    stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
-
-    held_out: with fewer photos than `HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no round and no step sees:
-    the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
-    trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are kept; then all
-    photos are fitted. 0: nothing is held out, and the last state is returned. checks: how often the PSNR is measured.
-    seed: of the order of the photos and of the blocks.
-    """
+    """How `refine` fits an avatar to its photos."""
 
     iterations: Iterations = knob(
         ITERATIONS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED
     )
+    """Of the learned update (see `learned.py`), before the first step. 0: none."""
     steps: RefineSteps | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    """Limit of the optimizer's steps. None: no limit. 0: iterations alone, which are always finished."""
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
+    """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit. It becomes a number of steps
+    before the first step, by the time that a few take; that number, `Refinement.planned`, repeats the run exactly."""
     image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
-    views_per_step: Few = knob(
-        1, cost="fewer steps in the same time; less noise", gain="one photo for each device", measured=MEASURED
-    )
+    """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
     structural: Weight = 0.2
+    """Weight of the structural dissimilarity beside the L1 distance of colors."""
     silhouette: Weight = 0.1
+    """Weight of |alpha - mask| beside the L1 distance of colors."""
+    optimizer: Literal["adam", "adabelief", "lion", "rmsprop", "sgd"] = "adam"
+    """What scales the gradients, by its name in optax. The rates suit the steps of Adam."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     full_steps: Steps = 100
+    """After iterations, a run of more steps than this takes smaller ones in proportion: Gaussians that move further overfit to
+    the photos."""
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
+    """A Gaussian whose largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what
+    no photo shows stays."""
     poses: bool = False
+    """Also refine the body pose of each photo. The corrected poses are not returned."""
     held_out: Share = 0.05
+    """With fewer photos than `run.HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no iteration and no step sees:
+    the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
+    trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are kept; then all
+    photos are fitted. 0: nothing is held out, and the last state is returned."""
     checks: Few = 5
+    """How often the PSNR is measured."""
     seed: Seed = 0
+    """Of the order of the photos and of the blocks."""
 
     def __post_init__(self):
         """Raises ValueError for settings that do not fit together, naming them."""

@@ -13,6 +13,7 @@ their neighbours. Gradient descent on the photos cannot do that.
 
 import functools
 import os
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any, cast
 
@@ -27,8 +28,8 @@ from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensors import read_safetensors
-from humangs_jax.refinement.objective import Image, Photos, drawn_photo
-from humangs_jax.refinement.parameters import Parameters
+from humangs_jax.refinement.objective import Image, Parameters, compiled, drawn_photo, pulled
+from humangs_jax.refinement.photos import Photo
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering
 
@@ -48,7 +49,7 @@ SEEN = 0.02
 """A Gaussian of this largest weight on a pixel of a photo counts as seen there."""
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
-"""Photos that a round looks at, as in training: sums over more are nothing that the network knows, and take longer."""
+"""Photos that an iteration looks at, as in training: sums over more are nothing that the network knows, and take longer."""
 
 
 @pytree_dataclass
@@ -147,7 +148,7 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 
 
 class Refiner(nn.Module):
-    """The network of a round.
+    """The network of an iteration.
 
     width: of its features. layers, cluster_layers: of messages between neighbours. per_photo: width for a photo.
     """
@@ -167,7 +168,7 @@ class Refiner(nn.Module):
         graph: Graph,
         center: Float[Array, "3"],
     ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
-        """(values, hidden) after a round; values: the parameters side by side, start: those before the first round."""
+        """(values, hidden) after an iteration; values: the parameters side by side, start: those before the first one."""
         dense = lambda name, width: nn.Dense(width, name=name)
         errors = _relative_errors(values, signals)
         seen = jnp.minimum(signals.visibility / SEEN, 1.0)[..., None]
@@ -238,36 +239,62 @@ def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
     return replace(like, **{name: part.reshape(x.shape) for (name, x), part in zip(shapes.items(), parts, strict=True)})
 
 
+def learned_update(
+    parameters: Parameters,
+    avatar: Avatar,
+    photos: Sequence[Photo],
+    graph: Graph,
+    iterations: int,
+    splat: SplatConfig,
+    poses: bool = False,
+) -> tuple[Parameters, Int[Array, ""]]:
+    """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced; and the overflow."""
+    start = values = stacked(parameters)
+    hidden, overflow = jnp.zeros((len(values), Refiner.width)), jnp.zeros((), jnp.int32)
+    used = min(len(photos), MOST_PHOTOS)
+    chosen = [photos[i * len(photos) // used] for i in range(used)]
+    for _ in range(iterations):
+        each = [photo_signals(parameters, avatar, photo, splat, poses) for photo in chosen]
+        signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
+        values, hidden = refiner_iteration(load_refiner(), values, start, hidden, signals, graph, avatar)
+        parameters, overflow = unstacked(values, parameters), overflow + jnp.sum(missing)
+    return parameters, overflow
+
+
 def photo_signals(
-    parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig
+    parameters: Parameters, avatar: Avatar, photo: Photo, splat: SplatConfig, poses: bool = False
 ) -> tuple[Signals, Int[Array, ""]]:
     """Signals of one photo (without the axis v), from the pixels that count; and the overflow. splat: with `visibility`."""
-    image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses=False)
-    gradient, _ = pull_back(squared_errors(image, photo))
-    _, pixels = pull_back(colors_alone(image))
-    return signals_from(gradient, pixels, rendering, photo), rendering.overflow
+    image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses)
+    gradient, _ = pulled(pull_back, squared_errors(image, photo))
+    _, colors = pulled(pull_back, colors_alone(image))
+    return signals_from(gradient, colors, rendering, photo), rendering.overflow
 
 
-def squared_errors(image: Image, photo: Photos) -> Image:
+@compiled
+def squared_errors(image: Image, photo: Photo) -> Image:
     """Gradient of the sum of squared errors with respect to the image."""
-    rgb = jnp.where(photo.counted[..., None], image[0] - photo.images, 0)
-    return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.masks, 0)
+    rgb = jnp.where(photo.counted[..., None], image[0] - photo.image, 0)
+    return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.mask, 0)
 
 
+@compiled
 def colors_alone(image: Image) -> Image:
     """Gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
-def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Rendering, photo: Photos) -> Signals:
+@compiled
+def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Rendering, photo: Photo) -> Signals:
     """Signals from `squared_errors` and `colors_alone`, both pulled back to the Gaussians."""
     assert rendering.visibility is not None
-    scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
+    scale = PERSON / jnp.maximum(jnp.sum(photo.mask), 1.0)
     # a change of all three colors of a Gaussian changes the sum of an image by three times its weights
     return Signals(scale * stacked(gradient), rendering.visibility, scale * colors / 3)
 
 
-def refiner_round(
+@compiled
+def refiner_iteration(
     variables: PyTree,
     values: Float[Array, "g 14"],
     start: Float[Array, "g 14"],
@@ -276,7 +303,7 @@ def refiner_round(
     graph: Graph,
     avatar: Avatar,
 ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
-    """`Refiner` on an avatar: (values, hidden) after a round."""
+    """`Refiner` on an avatar: (values, hidden) after an iteration."""
     center = jnp.mean(avatar.rest_joints, axis=0)
     return cast(Any, Refiner().apply(variables, values, start, hidden, signals, graph, center))
 

@@ -1,56 +1,100 @@
-"""What refinement minimises: the difference of an avatar's renderings from the photos.
+"""What refinement moves and what it minimises: unconstrained Gaussians, and the difference of their renderings from the photos.
 
-The Gaussians are skinned to the pose of each photo, so the photos may show different poses.
+The Gaussians are skinned to the pose of each photo, so the photos may show different poses. All functions are of one photo, pure,
+and pieces of few programs: a run on the host compiles one renderer and its transpose for steps, iterations and comparisons.
 """
 
 import dataclasses
+import functools
+import inspect
 from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh, PartitionSpec
+from jax.core import Tracer
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.views import SubjectViews
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.losses.metrics import decibels
 from humangs_jax.losses.ssim import structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.parameters import Parameters, gaussians_of
-from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.refinement.photos import Photo
+from humangs_jax.rendering.gaussians import Gaussians, widened
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
+from humangs_jax.rendering.unconstrained import UnconstrainedGaussians, constrain, unconstrain
 
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""
+FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
+"""On a CPU: compiles in 0.8 to 0.9 of the time of level 3, and the programs take the same time. Level 0: eight times."""
+P = ParamSpec("P")
+T = TypeVar("T")
+
+jax.tree_util.register_static(RefineConfig)  # here: its own module is imported by the command line, without JAX
+
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorator: called with arrays, a program of its own; inside of a transformation, a part of that program.
+
+    Parameters named config, splat and poses are static.
+    """
+
+    @functools.cache
+    def program() -> Callable[P, T]:
+        static = [name for name in ("config", "splat", "poses") if name in inspect.signature(function).parameters]
+        options = compiler_options()
+        return jax.jit(function, static_argnames=static, compiler_options=options and options | FASTER_COMPILATION)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return function(*args, **kwargs) if traced else program()(*args, **kwargs)
+
+    return call
+
+
+# Parameters --------------------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class Parameters:
+    """What refinement moves, each without bounds.
+
+    means: (g, 3) metres. quats: (g, 4). log_scales: (g, 3) of metres, no low-pass. opacity_logits: (g,). color_logits: (g, 3).
+    rotations: (v, j, 3) and translations: (v, 3), what is added to the pose of each photo.
+    """
+
+    means: Float[Array, "g 3"]
+    quats: Float[Array, "g 4"]
+    log_scales: Float[Array, "g 3"]
+    opacity_logits: Float[Array, " g"]
+    color_logits: Float[Array, "g 3"]
+    rotations: Float[Array, "v j 3"]
+    translations: Float[Array, "v 3"]
+
+
 PullBack = Callable[[Image], tuple[Parameters, Float[Array, " g"]]]
 """From the gradient with respect to an image to those with respect to the parameters, and to the brightness of each Gaussian."""
 
 
-@pytree_dataclass
-class Photos:
-    """Views to compare with (leading axis v), and the pixels of each that count: (v, h, w).
-
-    index: (v,) the number of the view, to which the changes of its pose belong.
-    """
-
-    images: Float[Array, "v h w 3"]
-    masks: Float[Array, "v h w"]
-    counted: Bool[Array, "v h w"]
-    cameras: Camera
-    rotations: Float[Array, "v j 3"]
-    translations: Float[Array, "v 3"]
-    index: Int[Array, " v"]
+def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
+    """Inverse of `gaussians_of`, as far as `unconstrain` is one; poses unchanged."""
+    free = unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
+    return Parameters(**vars(free), rotations=jnp.zeros((views, joints, 3)), translations=jnp.zeros((views, 3)))
 
 
-def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"]) -> Photos:
-    """All views of a person, with the pixels that count."""
-    index = jnp.arange(len(views.images))
-    return Photos(views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index)
+def gaussians_of(parameters: Parameters, low_pass: Float[Array, " g"] | None) -> Gaussians:
+    """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
+    names = [field.name for field in dataclasses.fields(UnconstrainedGaussians)]
+    gaussians = constrain(UnconstrainedGaussians(**{name: getattr(parameters, name) for name in names}))
+    return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
 
 
 def avatar_of(parameters: Parameters, avatar: Avatar) -> Avatar:
@@ -58,127 +102,99 @@ def avatar_of(parameters: Parameters, avatar: Avatar) -> Avatar:
     return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.low_pass))
 
 
-def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses: bool) -> Gaussians:
-    """The Gaussians in the pose of one photo (without the axis v), corrected as far as it has been refined.
+# Images and their difference from the photos -----------------------------------------------------------------------------
+
+
+def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photo, poses: bool) -> Gaussians:
+    """The Gaussians in the pose of a photo, corrected as far as it has been refined.
 
     poses: whether gradients reach the pose; they pass through the transforms of all Gaussians, which takes time.
     """
+    turned, moved = parameters.rotations, parameters.translations
     if not poses:
-        parameters = replace(
-            parameters,
-            rotations=jax.lax.stop_gradient(parameters.rotations),
-            translations=jax.lax.stop_gradient(parameters.translations),
-        )
-    pose = BodyPose(
-        photo.rotations + parameters.rotations[photo.index], photo.translations + parameters.translations[photo.index]
-    )
+        turned, moved = jax.lax.stop_gradient((turned, moved))
+    pose = BodyPose(photo.rotations + turned[photo.index], photo.translation + moved[photo.index])
     return skin(avatar_of(parameters, avatar), pose)
 
 
+@compiled
 def drawn_photo(
-    parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig, poses: bool
+    parameters: Parameters, avatar: Avatar, photo: Photo, splat: SplatConfig, poses: bool
 ) -> tuple[Image, PullBack, Rendering]:
-    """The image of one photo (without the axis v), its pull-back, and all that was rendered. poses: see `posed_gaussians`."""
+    """The image of a photo, its pull-back, and all that was rendered. poses: see `posed_gaussians`."""
 
     def draw(parameters, brightness):
         gaussians = posed_gaussians(parameters, avatar, photo, poses)
-        rendering = render(replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.cameras, splat)
+        rendering = render(replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.camera, splat)
         return (rendering.rgb, rendering.alpha), rendering
 
     return jax.vjp(draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True)
 
 
-def image_loss(image: Image, photo: Photos, config: RefineConfig) -> Scalar:
-    """Loss of one photo (without the axis v): L1 of colors, structural dissimilarity, L1 of coverage; means over the crop.
+@compiled
+def pulled(pull_back: PullBack, image: Image) -> tuple[Parameters, Float[Array, " g"]]:
+    """`pull_back` of an image, as a program."""
+    return pull_back(image)
+
+
+def image_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
+    """Loss of a photo: L1 of colors, structural dissimilarity, L1 of coverage; means over the crop.
 
     A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
     """
-    rgb = jnp.where(photo.counted[..., None], image[0], photo.images)
-    alpha = jnp.where(photo.counted, image[1], photo.masks)
+    rgb = jnp.where(photo.counted[..., None], image[0], photo.image)
+    alpha = jnp.where(photo.counted, image[1], photo.mask)
     return (
-        jnp.mean(jnp.abs(rgb - photo.images))
-        + config.structural * jnp.mean(structural_dissimilarity(rgb, photo.images))
-        + config.silhouette * jnp.mean(jnp.abs(alpha - photo.masks))
+        jnp.mean(jnp.abs(rgb - photo.image))
+        + config.structural * jnp.mean(structural_dissimilarity(rgb, photo.image))
+        + config.silhouette * jnp.mean(jnp.abs(alpha - photo.mask))
     )
+
+
+@compiled
+def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
+    """Gradient of `image_loss` with respect to the image."""
+    return jax.grad(image_loss)(image, photo, config)
 
 
 @pytree_dataclass
 class Comparison:
-    """Comparison of an avatar with photos. loss: mean over them. squared: mean squared error of the pixels that count.
+    """Comparison of an avatar with a photo (or with each of some, leading axis v).
 
-    visibility: (g,) the largest weight of each Gaussian on any pixel of the photos. overflow: what the buffers had no room for.
+    squared: sum over the pixels that count, `pixels` of them, of the squared error. visibility: (g,) the largest weight of each
+    Gaussian on any pixel. overflow: what the buffers had no room for.
     """
 
-    loss: Scalar
-    squared: Scalar
-    visibility: Float[Array, " g"]
-    overflow: Int[Array, ""]
+    loss: Float[Array, "*v"]
+    squared: Float[Array, "*v"]
+    pixels: Float[Array, "*v"]
+    visibility: Float[Array, "*v g"]
+    overflow: Int[Array, "*v"]
+
+    def together(self) -> "Comparison":
+        """With all photos: the mean loss, sums of the errors, the largest visibility."""
+        sums = (jnp.sum(x) for x in (self.squared, self.pixels))
+        return Comparison(jnp.mean(self.loss), *sums, jnp.max(self.visibility, axis=0), jnp.sum(self.overflow))
+
+    @property
+    def psnr(self) -> Float[Array, "*v"]:
+        """Over the pixels that count, dB."""
+        return decibels(safe_divide(self.squared, self.pixels))
 
 
-def compare_photos(
-    parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
+def compare(
+    parameters: Parameters, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig
 ) -> Comparison:
-    """Comparison with the photos, one after the other."""
+    """Comparison with a photo."""
     splat = dataclasses.replace(splat, visibility=True)
-
-    def one(photo):
-        image, _, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
-        return compared(image, rendering, photo, config)
-
-    return comparison_of(jax.lax.map(one, photos), photos)
+    image, _, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
+    return compared(image, rendering, photo, config)
 
 
-def compared(image: Image, rendering: Rendering, photo: Photos, config: RefineConfig) -> Comparison:
-    """One photo. squared: sum over its pixels."""
-    squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.images), axis=-1)
+@compiled
+def compared(image: Image, rendering: Rendering, photo: Photo, config: RefineConfig) -> Comparison:
+    """`compare`, from the image of the photo."""
+    squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.image), axis=-1)
     assert rendering.visibility is not None
-    loss = image_loss(image, photo, config)
-    return Comparison(loss, jnp.sum(squared * photo.counted), rendering.visibility, rendering.overflow)
-
-
-def comparison_of(each: Comparison, photos: Photos) -> Comparison:
-    """Comparison with all photos, from that with each (leading axis v)."""
-    return Comparison(
-        jnp.mean(each.loss),
-        safe_divide(jnp.sum(each.squared), jnp.sum(photos.counted, dtype=each.squared.dtype)),
-        jnp.max(each.visibility, axis=0),
-        jnp.sum(each.overflow),
-    )
-
-
-def photos_gradient(
-    parameters: Parameters,
-    avatar: Avatar,
-    photos: Photos,
-    config: RefineConfig,
-    splat: SplatConfig,
-    mesh: Mesh | None = None,
-) -> tuple[Parameters, Scalar, Int[Array, ""]]:
-    """Gradient of the mean over the photos, the mean and the overflow. mesh: of one axis, whose devices share the photos."""
-
-    def total(parameters, avatar, photos):
-        def one(photo):
-            image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
-            value, error = jax.value_and_grad(image_loss)(image, photo, config)
-            return pull_back(error)[0], value, rendering.overflow
-
-        # unrolled: a CPU runs the loops of the renderer more slowly inside of another loop
-        each = [one(jax.tree.map(lambda x, i=i: x[i], photos)) for i in range(len(photos.images))]
-        return jax.tree.map(lambda *x: sum(x[1:], x[0]), *each)
-
-    count = len(photos.images)
-    if mesh is None:
-        gradient, value, overflow = total(parameters, avatar, photos)
-    else:
-        (axis,) = mesh.axis_names
-        mesh = Mesh(mesh.devices, mesh.axis_names)  # automatic axes: the compiler shards what lies outside
-        everywhere = PartitionSpec()
-        share = jax.shard_map(
-            lambda *arguments: jax.lax.psum(total(*arguments), axis),
-            mesh=mesh,
-            in_specs=(everywhere, everywhere, PartitionSpec(axis)),
-            out_specs=everywhere,
-            check_vma=False,
-        )
-        gradient, value, overflow = share(parameters, avatar, photos)
-    return jax.tree.map(lambda x: x / count, gradient), value / count, overflow
+    errors = image_loss(image, photo, config), jnp.sum(squared * photo.counted)
+    return Comparison(*errors, jnp.sum(photo.counted, dtype=squared.dtype), rendering.visibility, rendering.overflow)

@@ -29,7 +29,7 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.presets import tiny
-from humangs_jax.refinement.crops import crop_to_person
+from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import SplatConfig, render
 

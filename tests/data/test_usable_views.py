@@ -13,7 +13,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.usable_views import shares_on_masks, usable_indices, usable_views
 from humangs_jax.data.views import select_views, standardize
-from humangs_jax.refinement.crops import crop_to_person
+from humangs_jax.refinement.photos import crop_to_person
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,34 @@
 """One size of buffers for all tests of the normal lane, so that they share compiled programs; slow tests plan their own."""
 
 import pytest
+from refinement_cases import toy_avatar, toy_capture
 
-from humangs_jax.refinement import operations, refine
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.refinement import search
 from humangs_jax.rendering.splat_config import SplatConfig
+
+SAME = SplatConfig(max_pairs=1 << 14, max_rows=1 << 13, visibility=True)
 
 
 @pytest.fixture(autouse=True)
 def same_buffers(request, monkeypatch):
     if request.node.get_closest_marker("slow") is None:
-        for module in (operations, refine):
-            monkeypatch.setattr(
-                module, "planned", lambda avatar, photos: SplatConfig(max_pairs=1 << 14, max_rows=1 << 13)
-            )
+        monkeypatch.setattr(search, "planned", lambda avatar, views: SAME)
+
+
+@pytest.fixture(scope="session")
+def body():
+    return decimate(load_body(), 400)
+
+
+@pytest.fixture(scope="session")
+def person(body):
+    """The avatar to be refined, and photos of the same one in other colors."""
+    return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), moving=True)
+
+
+@pytest.fixture(scope="session")
+def four(body):
+    """An avatar, and four photos of the person, whom it shows in other colors."""
+    return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=4)

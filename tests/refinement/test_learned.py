@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from refinement_cases import STEPS, toy_avatar, toy_capture
 
-from humangs_jax.body.decimation import decimate
-from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
+from humangs_jax.refinement import learned, search
 from humangs_jax.refinement import refine as refinement
-from humangs_jax.refinement.crops import crop_to_person
 from humangs_jax.refinement.learned import (
     COLUMNS,
     PERSON,
@@ -20,18 +18,18 @@ from humangs_jax.refinement.learned import (
     Signals,
     clusters_of,
     graph_of,
+    learned_update,
     load_refiner,
     neighbor_mean,
     neighbors_of,
     photo_signals,
-    refiner_round,
+    refiner_iteration,
     save_refiner,
     stacked,
     unstacked,
 )
-from humangs_jax.refinement.objective import comparison_of, photos_of, posed_gaussians
-from humangs_jax.refinement.parameters import parameters_of
-from humangs_jax.refinement.run import Run
+from humangs_jax.refinement.objective import parameters_of, posed_gaussians
+from humangs_jax.refinement.photos import crop_to_person, photos_of
 from humangs_jax.rendering.splatting import plan_buffers, render
 
 DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a color; float32 sums over some thousand pixels
@@ -40,19 +38,18 @@ ONE_STEP = 1e-3  # metres: five times the rate of the means
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene(body):
     """Avatar, one photo of the same person in other colors, parameters, splatting."""
-    body = decimate(load_body(), 400)
     avatar = toy_avatar(body, 0.0)
     views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
-    photo = jax.tree.map(lambda x: x[0], photos_of(views, jnp.ones(views.masks.shape, bool)))
+    photo = photos_of(views)[0]
     splat = dataclasses.replace(plan_buffers(avatar.gaussians, views.cameras, margin=2.0), visibility=True)
     return avatar, photo, parameters_of(avatar.gaussians, 3, 55), splat
 
 
 def drawn(scene, parameters):
     avatar, photo, _, splat = scene
-    return render(posed_gaussians(parameters, avatar, photo, poses=False), photo.cameras, splat)
+    return render(posed_gaussians(parameters, avatar, photo, poses=False), photo.camera, splat)
 
 
 def signals_of(scene, photo=None):
@@ -126,7 +123,7 @@ def test_clusters_carry_what_one_end_knows_to_the_other(scene):
     values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
     signals = jax.tree.map(lambda x: x[None], signals_of(scene))
     hidden = jnp.zeros((len(values), Refiner.width))
-    moves = lambda hidden: refiner_round(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
+    moves = lambda hidden: refiner_iteration(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
     lowest, highest = np.argsort(np.asarray(values[:, 1]))[[0, -1]]
     changed = moves(hidden.at[lowest].set(10.0)) - moves(hidden)
     assert np.abs(changed[highest]).max() > 0
@@ -141,7 +138,7 @@ def test_parameters_side_by_side_and_back(scene):
 
 def test_pixels_are_the_sums_of_the_weights(scene):
     signals, rendering = signals_of(scene), drawn(scene, scene[2])
-    per_person = PERSON / float(scene[1].masks.sum())
+    per_person = PERSON / float(scene[1].mask.sum())
     assert float(signals.pixels.sum()) == pytest.approx(per_person * float(rendering.alpha.sum()), rel=1e-4)
     assert (np.asarray(signals.pixels) >= -ROUNDING).all()
     np.testing.assert_allclose(signals.visibility, rendering.visibility, atol=ROUNDING)
@@ -154,20 +151,19 @@ def test_gradients_are_those_of_the_squared_error(scene):
     def error(shift):
         moved = replace(parameters, color_logits=parameters.color_logits.at[most].add(shift))
         rendering = drawn(scene, moved)
-        squared = np.square(rendering.rgb - photo.images, dtype=np.float64).sum()
-        return squared + np.square(rendering.alpha - photo.masks, dtype=np.float64).sum()
+        squared = np.square(rendering.rgb - photo.image, dtype=np.float64).sum()
+        return squared + np.square(rendering.alpha - photo.mask, dtype=np.float64).sum()
 
     slope = (error(DIFFERENCE) - error(-DIFFERENCE)) / (2 * DIFFERENCE)
-    gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.masks.sum()) / PERSON
+    gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.mask.sum()) / PERSON
     assert gradient == pytest.approx(slope, rel=DIFFERENCES)
 
 
 def test_a_run_sees_the_signals_of_training(scene):
-    avatar, _, parameters, splat = scene
-    body = decimate(load_body(), 400)
-    run = Run(avatar, crop_to_person(toy_capture(body, toy_avatar(body, 0.15))), STEPS, None, splat)
-    expected = signals_of(scene, jax.tree.map(lambda x: x[1], run.seen))
-    for got, wanted in zip(jax.tree.leaves(run.signals(parameters, 1)), jax.tree.leaves(expected), strict=True):
+    """Programs of one piece each, and one of all."""
+    avatar, photo, parameters, splat = scene
+    pieces = photo_signals(parameters, avatar, photo, splat)[0]
+    for got, wanted in zip(jax.tree.leaves(pieces), jax.tree.leaves(signals_of(scene)), strict=True):
         np.testing.assert_allclose(got, wanted, atol=ROUNDING * np.abs(wanted).max())
 
 
@@ -185,10 +181,10 @@ def test_untrained_it_changes_nothing_and_trained_it_does(scene):
     fresh = Refiner().init(jax.random.key(0), values, values, hidden, signals, graph, jnp.zeros(3))
     shipped = load_refiner()
     assert jax.tree.map(jnp.shape, fresh) == jax.tree.map(jnp.shape, shipped)
-    same, carried = refiner_round(fresh, values, values, hidden, signals, graph, avatar)
+    same, carried = refiner_iteration(fresh, values, values, hidden, signals, graph, avatar)
     np.testing.assert_array_equal(same, values)
     assert np.asarray(carried).any()
-    moved, _ = refiner_round(shipped, values, values, hidden, signals, graph, avatar)
+    moved, _ = refiner_iteration(shipped, values, values, hidden, signals, graph, avatar)
     assert np.isfinite(moved).all() and (np.asarray(moved) != np.asarray(values)).any()
 
 
@@ -197,13 +193,13 @@ def test_the_order_of_photos_does_not_matter(scene):
     rng, values = np.random.default_rng(3), stacked(parameters)
     graph, g = graph_of(np.asarray(avatar.gaussians.means)), len(values)
     signals = Signals(*(jnp.asarray(rng.random(shape), jnp.float32) for shape in ((3, g, COLUMNS), (3, g), (3, g))))
-    run = lambda s: refiner_round(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[0]
+    run = lambda s: refiner_iteration(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[
+        0
+    ]
     np.testing.assert_allclose(run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING)
 
 
 def test_weights_are_read_as_written(tmp_path, monkeypatch):
-    from humangs_jax.refinement import learned
-
     changed = jax.tree.map(lambda x: x + 1, load_refiner())
     save_refiner(tmp_path / "refiner.safetensors", changed)
     monkeypatch.setattr(learned.resources, "files", lambda _: tmp_path)
@@ -212,80 +208,56 @@ def test_weights_are_read_as_written(tmp_path, monkeypatch):
 
 
 def test_iterations_move_gaussians(scene):
-    avatar, _, _, splat = scene
-    views = crop_to_person(toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15)))
-    config = dataclasses.replace(STEPS, iterations=2, steps=0)
-    run = Run(avatar, views, config, None, splat)
-    before = refinement.start(run.avatar, run.all, config, splat)
-    was, now = stacked(before.parameters), stacked(run.learned(before.parameters, 2))
-    assert (np.abs(now - was).max(axis=0) > 0).all()
-    report = run.go(progress=False, watch=None)
-    assert (report.iterations, report.steps) == (2, 0) and "2 iterations and 0 steps" in report.summary()
-    assert report.loss[1] <= report.loss[0]
+    avatar, photo, parameters, splat = scene
+    graph = graph_of(np.asarray(avatar.gaussians.means))
+    after, overflow = learned_update(parameters, avatar, [photo], graph, 2, splat)
+    assert (np.abs(stacked(after) - stacked(parameters)).max(axis=0) > 0).all() and not overflow
 
 
-def test_iterations_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monkeypatch):
-    avatar, _, _, splat = scene
-    capture = toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15), views=9)
-    config = dataclasses.replace(STEPS, iterations=1, steps=0)
-    small = dataclasses.replace(splat, max_pairs=64)
-    run = Run(avatar, crop_to_person(capture), config, None, small)
-    looked, signals = [], run.signals
-    monkeypatch.setattr(run, "signals", lambda parameters, view: looked.append(int(view)) or signals(parameters, view))
-    before = refinement.start(run.avatar, run.all, config, splat)
-    after = run.learned(before.parameters, 1)
-    assert looked == [0, 1, 3, 4, 6, 7] and run.splat.max_pairs > 64
-    monkeypatch.undo()
-    run.splat = dataclasses.replace(run.splat, max_pairs=2 * run.splat.max_pairs)
-    jax.tree.map(np.testing.assert_array_equal, run.learned(before.parameters, 1), after)
+def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(scene, monkeypatch):
+    avatar, photo, parameters, splat = scene
+    looked, signals = [], learned.photo_signals
+    watched = lambda parameters, avatar, photo, *how: (
+        looked.append(int(photo.index)) or signals(parameters, avatar, photo, *how)
+    )
+    monkeypatch.setattr(learned, "photo_signals", watched)
+    photos = [replace(photo, index=jnp.asarray(i)) for i in range(9)]
+    graph, small = graph_of(np.asarray(avatar.gaussians.means)), dataclasses.replace(splat, max_pairs=64)
+    assert learned_update(parameters, avatar, photos, graph, 1, small)[1] > 0
+    assert looked == [0, 1, 3, 4, 6, 7]
 
 
-def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, monkeypatch):
+def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, body, monkeypatch):
     """A Gaussian that is hidden at the start and seen after the iterations gets trust."""
-    body = decimate(load_body(), 400)
-    hidden = replace(
-        scene[0], gaussians=replace(scene[0].gaussians, opacities=scene[0].gaussians.opacities.at[0].set(0))
+    gaussians = scene[0].gaussians
+    hidden = replace(scene[0], gaussians=replace(gaussians, opacities=gaussians.opacities.at[0].set(0)))
+    shown = lambda parameters, *_: (
+        replace(parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)),
+        jnp.zeros((), int),
     )
-    shown = lambda self, parameters, iterations: replace(
-        parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)
-    )
-    monkeypatch.setattr(Run, "learned", shown)
-    run = Run(
-        hidden,
-        crop_to_person(toy_capture(body, toy_avatar(body, 0.15))),
-        dataclasses.replace(STEPS, iterations=1),
-        None,
-        scene[3],
-    )
-    before = refinement.start(run.avatar, run.all, run.compiled_for, run.splat)
-    found = comparison_of(run.compared(run.learned(before.parameters, 1), run.held), run.held)
-    after = run.state(run.learned(before.parameters, 1), found)
-    assert before.trust[0] == 0 and after.trust[0] > 0
+    monkeypatch.setattr(search, "learned_update", shown)
+    config = dataclasses.replace(STEPS, iterations=1)
+    views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
+    task, start, _ = search.prepare(hidden, views, config, search.Clock(config))
+    after = search.iterated(task, start, start.used)[0].state
+    assert start.state.trust[0] == 0 and after.trust[0] > 0
     jax.tree.map(np.testing.assert_array_equal, after.parameters, after.start)
 
 
-def test_interrupted_in_the_iterations_the_start_is_returned(scene, monkeypatch):
-    def interrupted(self, parameters, iterations):
-        raise KeyboardInterrupt
-
-    body = decimate(load_body(), 400)
-    monkeypatch.setattr(Run, "learned", interrupted)
-    config = dataclasses.replace(STEPS, iterations=2, steps=0)
-    report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
-    assert report.interrupted and (report.iterations, report.steps) == (0, 0)
-    jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
+def interrupted(*_):
+    raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("steps", [0, 1])
-def test_iterations_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatch):
-    def worse(self, parameters, iterations):
-        return replace(parameters, means=parameters.means + 0.3)
+def worse(parameters, *_):
+    return replace(parameters, means=parameters.means + 0.3), jnp.zeros((), int)
 
-    body = decimate(load_body(), 400)
-    monkeypatch.setattr(Run, "learned", worse)
+
+@pytest.mark.parametrize(("update", "steps"), [(interrupted, 0), (worse, 0), (worse, 1)])
+def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(update, steps, scene, body, monkeypatch):
+    monkeypatch.setattr(search, "learned_update", update)
     config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
-    assert report.iterations == 0
+    assert report.interrupted == (update is interrupted) and (report.iterations, report.steps) == (0, steps)
     if not steps:
         assert not report.kept
         jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])

@@ -1,14 +1,18 @@
 """The photos that refinement compares with: cut to the person, reduced, with the pixels that are held out."""
 
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Array, Bool
-from humangs_jax.core.pytree import replace
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews, upright
+from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
 """Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the silhouette cost alpha there."""
@@ -18,6 +22,27 @@ COVERED = 0.02
 """Coverage from which a pixel counts as the person's."""
 BLOCK = 8
 """Side of the blocks of pixels that are held out."""
+
+
+@pytree_dataclass
+class Photo(Batchable):
+    """A view to compare with, and which of its pixels count. index: its number, to which the changes of its pose belong."""
+
+    image: Float[Array, "h w 3"]
+    mask: Float[Array, "h w"]
+    counted: Bool[Array, "h w"]
+    camera: Camera
+    rotations: Float[Array, "j 3"]
+    translation: Float[Array, "3"]
+    index: Int[Array, ""]
+
+
+def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"] | None = None) -> Photo:
+    """The views of a person as a batch of photos. counted: None for all pixels."""
+    counted = jnp.ones(views.masks.shape, bool) if counted is None else counted
+    index = jnp.arange(len(views.images))
+    leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index
+    return jax.vmap(Photo)(*leaves)
 
 
 def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
@@ -38,16 +63,18 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
     height, width = masks.shape[1:]
     boxes = [_bounds(mask) for mask in masks]
     rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
-    crop = lambda arrays: np.stack(
-        [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
-    )
     corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
+
+    def crop(arrays: Float[np.ndarray, "v h w *c"]) -> Float[Array, "v rows columns *c"]:
+        windows = [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
+        return jnp.asarray(np.stack(windows), jnp.float32)
+
     shift = np.zeros((len(images), 3, 3), np.float32)
     shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
     frames = np.asarray(capture.frames)
     views = SubjectViews(
-        images=jnp.asarray(crop(images), jnp.float32),
-        masks=jnp.asarray(crop(masks), jnp.float32),
+        images=crop(images),
+        masks=crop(masks),
         cameras=replace(cameras, K=cameras.K - shift, width=columns, height=rows),
         rotations=jnp.asarray(capture.poses.rotations)[frames],
         translations=jnp.asarray(capture.poses.translation)[frames],
@@ -56,24 +83,29 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
     return upright(views, capture.body)
 
 
-def held_out_blocks(views: SubjectViews, share: float, seed: int) -> Bool[Array, "v h w"]:
-    """Which pixels no step sees: random blocks, `share` of all."""
-    v, height, width = views.masks.shape
+def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:
+    """Which pixels of (v, h, w) no step sees: random blocks, `share` of all."""
+    v, height, width = shape
+    blocks = np.random.default_rng(seed).random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
+    return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
+
+
+def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.ndarray, " n"]:
+    """The view of each step: all in a new order, again and again."""
     rng = np.random.default_rng(seed)
-    blocks = rng.random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
-    return jnp.asarray(blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width])
+    return np.concatenate([np.zeros(0, int), *(rng.permutation(views) for _ in range(-(-steps // len(views))))])[:steps]
 
 
-def _bounds(mask):
+def _bounds(mask: Float[np.ndarray, "h w"]) -> Sequence[Sequence[int]]:
     """((top, bottom), (left, right)) of the person; the whole image if nobody is in it."""
     box = person_box(mask > COVERED).tolist()
     return box if any(box[0]) else [(0, size) for size in mask.shape]
 
 
-def _window(bounds, size):
+def _window(bounds: Sequence[Sequence[int]], size: int) -> int:
     longest = max(stop - start for start, stop in bounds) + 2 * MARGIN
     return min(size, -(-longest // MULTIPLE) * MULTIPLE)
 
 
-def _corner(bounds, window, size):
+def _corner(bounds: Sequence[int], window: int, size: int) -> int:
     return int(np.clip((bounds[0] + bounds[1] - window) // 2, 0, size - window))

@@ -1,0 +1,131 @@
+"""Adam's part of refinement: an explicit state, and a step that makes the next one from a photo.
+
+Everything is a pure function for one person: on the host a few compiled programs, under `jax.jit` and `jax.vmap` one.
+"""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.low_pass import with_low_pass_of
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.objective import (
+    Comparison,
+    Parameters,
+    avatar_of,
+    compare,
+    compiled,
+    drawn_photo,
+    loss_gradient,
+    parameters_of,
+    pulled,
+)
+from humangs_jax.refinement.photos import Photo, photos_of
+from humangs_jax.rendering.splat_config import SplatConfig
+
+PULLED = ("means", "log_scales")
+"""Parameters that each step moves back towards the start, by `DECAY` of the distance."""
+DECAY = 2e-3
+FINAL_RATE = 0.1
+"""Share of the learning rates that is left at the end."""
+OPTIMIZERS: dict[str, Callable[[], optax.GradientTransformation]] = {
+    "adam": optax.scale_by_adam,
+    "adabelief": optax.scale_by_belief,
+    "lion": optax.scale_by_lion,
+    "rmsprop": optax.scale_by_rms,
+    "sgd": optax.identity,
+}
+"""By `RefineConfig.optimizer`."""
+
+
+@pytree_dataclass
+class RefineState:
+    """All that steps change, and what they know of the run.
+
+    start: the parameters before the first step. trust: (g,) share of the rates at which a Gaussian moves. moments: those of the
+    optimizer. overflow: (splat, tile) pairs for which the last step had no room. splat: how photos are drawn, with buffers. done,
+    total: steps. share: of the rates, in the whole run.
+    """
+
+    parameters: Parameters
+    start: Parameters
+    trust: Float[Array, " g"]
+    moments: PyTree
+    overflow: Int[Array, ""]
+    splat: SplatConfig
+    done: Int[Array, ""] | int = 0
+    total: Int[Array, ""] | int = 1
+    share: Float[Array, ""] | float = 1.0
+
+
+def init_state(parameters: Parameters, found: Comparison, config: RefineConfig, splat: SplatConfig) -> RefineState:
+    """The state before the first step. found: comparison of the parameters with the photos; Gaussians that no photo shows get
+    no trust.
+    """
+    moments = OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
+    return RefineState(parameters, parameters, _trust(found.visibility, config), moments, found.overflow, splat)
+
+
+@compiled
+def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array, " g"]:
+    return jnp.minimum(visibility / config.visible, 1.0)
+
+
+def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig) -> RefineState:
+    """The state after one step on a photo. Where it overflows, it is not to be used: repeat it with larger buffers."""
+    image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat, config.poses)
+    gradient, _ = pulled(pull_back, loss_gradient(image, photo, config))
+    return update(replace(state, overflow=rendering.overflow), gradient, config)
+
+
+@compiled
+def update(state: RefineState, gradient: Parameters, config: RefineConfig) -> RefineState:
+    """The optimizer's step, with a rate for each parameter.
+
+    Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
+    """
+    steps, moments = OPTIMIZERS[config.optimizer]().update(cast(Any, gradient), state.moments)
+    cosine = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + jnp.cos(jnp.pi * (state.done / state.total)))
+
+    def moved(name: str) -> Array:
+        value, step = getattr(state.parameters, name), getattr(steps, name)
+        rate = state.share * cosine * getattr(config.rates, name)
+        if name in ("rotations", "translations"):
+            return value - rate * step if config.poses else value
+        value = value - rate * state.trust.reshape(-1, *[1] * (value.ndim - 1)) * step
+        return value - DECAY * (value - getattr(state.start, name)) if name in PULLED else value
+
+    parameters = Parameters(**{name: moved(name) for name in vars(state.parameters)})
+    return replace(state, parameters=parameters, moments=moments, done=state.done + 1)
+
+
+def refine_views(
+    avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
+) -> tuple[Avatar, Int[Array, ""]]:
+    """`steps` steps of one photo each, in turns, on all pixels: `refine` without its decisions, for `jax.jit` and `jax.vmap`.
+
+    Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat (with `max_pairs`, see
+    `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
+    the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    """
+    avatar, photos = with_low_pass_of(avatar, views), photos_of(views)
+    parameters = parameters_of(avatar.gaussians, len(views.images), len(avatar.parents))
+    found = jax.lax.map(lambda photo: compare(parameters, avatar, photo, config, splat), photos)
+    state = replace(init_state(parameters, found.together(), config, splat), total=steps)
+
+    def one(state: RefineState, i: Int[Array, ""]) -> tuple[RefineState, Int[Array, ""]]:
+        photo = jax.tree.map(lambda x: x[i % len(views.images)], photos)
+        state = step(state, photo, avatar, config)
+        return state, state.overflow
+
+    # the loop carries arrays
+    state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(steps), share=jnp.ones(()))
+    state, overflow = jax.lax.scan(one, state, jnp.arange(steps))
+    return avatar_of(state.parameters, avatar), jnp.sum(overflow)
