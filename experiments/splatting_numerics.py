@@ -21,9 +21,9 @@ import numpy as np
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.constants import ALPHA_MIN, NEAR
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
+from humangs_jax.rendering.splat_config import ALPHA_MIN, NEAR
 from humangs_jax.rendering.splatting import render
 
 WIDTH, HEIGHT, COUNT = 24, 16, 32

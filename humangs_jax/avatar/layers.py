@@ -35,9 +35,9 @@ from humangs_jax.io.atomic import add_files
 from humangs_jax.io.exr import ExrView, write_exr
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import limits
-from humangs_jax.rendering.drawing import Rendering
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splatting import Rendering
 
 LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"

@@ -22,7 +22,7 @@ from humangs_jax.evaluation.tables import Row, mean_scores
 from humangs_jax.losses.metrics import boundary_band, decibels, masked_psnr, semi_transparent, silhouette_iou
 from humangs_jax.losses.perceptual import BACKBONES, Lpips, lpips, smallest_side
 from humangs_jax.losses.ssim import SsimWindow, mean_similarity, similarity_map
-from humangs_jax.rendering.buffers import round_up
+from humangs_jax.rendering.splatting import round_up
 
 PATCH, STRIDE = 64, 32
 """Side and distance of the patches, pixels."""

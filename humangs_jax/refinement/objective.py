@@ -25,10 +25,9 @@ from humangs_jax.losses.metrics import decibels
 from humangs_jax.losses.ssim import structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.photos import Photo
-from humangs_jax.rendering.gaussians import Gaussians, widened
+from humangs_jax.rendering.gaussians import Gaussians, UnconstrainedGaussians, constrain, unconstrain, widened
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
-from humangs_jax.rendering.unconstrained import UnconstrainedGaussians, constrain, unconstrain
 
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""

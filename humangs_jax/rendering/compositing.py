@@ -20,9 +20,8 @@ alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0 whe
 sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give the gradient of a splat's shape. They are matrix products
 with monomials about the tile's centre that are moved to the splat's centre afterwards.
 
-The order of the work is chosen by a schedule: `small_blocks` on CPUs, `fat_chunks` elsewhere. A schedule is
-two functions, `forward(grid, config)` and `backward(grid, config)`. `vmap` joins the tiles of all images into one list
-of tiles, so a batch is one call with more tiles, not a loop of masked loops.
+The order of the work is that of `schedules`: small blocks on CPUs, fat chunks elsewhere. `vmap` joins the tiles of all images
+into one list of tiles, so a batch is one call with more tiles, not a loop of masked loops.
 """
 
 import functools
@@ -32,9 +31,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.rendering import schedules
 from humangs_jax.rendering.projection import ProjectedGaussians
-from humangs_jax.rendering.schedules import fat_chunks, small_blocks
-from humangs_jax.rendering.schedules.splat_rows import R00, R01, R11
+from humangs_jax.rendering.schedules import R00, R01, R11
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
@@ -78,7 +77,7 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 
 
 def _scheduled(direction, grid, config, *arrays):
-    on_cpu, elsewhere = (getattr(schedule, direction)(grid, config) for schedule in (small_blocks, fat_chunks))
+    on_cpu, elsewhere = (getattr(schedules, f"{direction}_by_{order}")(grid, config) for order in ("blocks", "chunks"))
     return lax.platform_dependent(*arrays, cpu=on_cpu, default=elsewhere)
 
 

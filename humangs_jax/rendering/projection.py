@@ -31,9 +31,16 @@ from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering import constants
 from humangs_jax.rendering.gaussians import Gaussians, added_variance
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splat_config import (
+    ALPHA_MIN,
+    DEFAULT_CONFIG,
+    EPS2D,
+    LARGEST_FOOTPRINT,
+    LEAST_DIMMING,
+    NEAR,
+    SplatConfig,
+)
 
 
 class ProjectedGaussians(NamedTuple):
@@ -76,8 +83,8 @@ class ProjectedGaussians(NamedTuple):
 def project(
     gaussians: Gaussians,
     camera: Camera,
-    near: float = constants.NEAR,
-    eps2d: float = constants.EPS2D,
+    near: float = NEAR,
+    eps2d: float = EPS2D,
     jacobian_margin: float | None = None,
     normalize_quats: bool = True,
 ) -> ProjectedGaussians:
@@ -108,7 +115,7 @@ def project(
     ]
     m = _times_factors(jw, gaussians, normalize_quats)
 
-    small = _all([jnp.abs(entry) < constants.LARGEST_FOOTPRINT for row in m for entry in row])
+    small = _all([jnp.abs(entry) < LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
     xx, xy, yy, determinant = _covariance(m0, m1, eps2d)
     dimming = None
@@ -146,7 +153,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
     )
 
 
-def squared_reach(opacities: Float[Array, " g"], alpha_min: float = constants.ALPHA_MIN) -> Float[Array, " g"]:
+def squared_reach(opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN) -> Float[Array, " g"]:
     """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
     opacities = lax.stop_gradient(opacities)
     seen = opacities > alpha_min
@@ -167,7 +174,7 @@ def _dimming(m0, m1, determinant, eps2d, low_pass):
     m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
     contained = _covariance(m0, m1, eps2d * jnp.minimum(jnp.square(low_pass), 1.0))[3]
     share = jnp.where(finite, contained / jnp.where(finite, determinant, 1.0), 1.0)
-    return jnp.sqrt(jnp.maximum(share, constants.LEAST_DIMMING**2))
+    return jnp.sqrt(jnp.maximum(share, LEAST_DIMMING**2))
 
 
 def _cross(m0, m1, j, i):

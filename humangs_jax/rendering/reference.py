@@ -18,10 +18,9 @@ from jax import lax
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
-from humangs_jax.rendering.drawing import Background, Rendering, with_background
 from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, LARGEST_FOOTPRINT, SplatConfig, splat_config
+from humangs_jax.rendering.splatting import Background, Rendering, with_background
 
 
 @checked_arguments

@@ -6,7 +6,49 @@ from typing import Annotated, Literal
 import jax
 
 from humangs_jax.core.configuration import Chunk, Presets, Range, Share, Slots, Spread, configuration, knob
-from humangs_jax.rendering import constants
+
+NEAR = 0.01
+"""Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA `INRIA_NEAR`."""
+
+INRIA_NEAR = 0.2
+
+EPS2D = 0.3
+"""Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a Gaussian thinner than a
+pixel falls between pixel centres. The same in INRIA and gsplat; opacity is not compensated for it (gsplat
+"classic")."""
+
+MIP_EPS2D = 0.1
+"""Pixels^2, for Gaussians whose scales contain the low-pass of the images that they were fitted to: about the footprint of a
+pixel, so that images of other sizes show them as wide as those did (Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
+
+LEAST_DIMMING = 1e-4
+"""Of opacities, by the variance that is added: a factor too small to be seen, which keeps gradients finite."""
+
+ALPHA_MIN = 1 / 255
+"""A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
+
+ALPHA_MAX = 0.999
+"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat 0.999; INRIA `INRIA_ALPHA_MAX`."""
+
+INRIA_ALPHA_MAX = 0.99
+
+TRANSMITTANCE_STOP = 1e-4
+"""A pixel ends before the splat that would leave a transmittance T <= this. The same everywhere."""
+
+INRIA_JACOBIAN_MARGIN = 0.3
+"""INRIA and gsplat evaluate the projection's Jacobian no farther out than this fraction of the half field of view
+beyond the image's border: it bounds the footprints of Gaussians beside a near camera, at the price of a wrong shape
+there."""
+
+INRIA_RADIUS_SIGMA = 3.0
+"""Standard deviations after which INRIA cuts a square around a splat (gsplat: 3.33); visible for opaque splats."""
+
+LARGEST_FOOTPRINT = 1e9
+"""Pixels; a Gaussian with a longer projected axis is not drawn. Its square's square would overflow float32."""
+
+INRIA_TILE_SIZE = 16
+"""Pixels. It matters where a square cuts splats off: they are drawn on whole tiles."""
+
 
 MEASURED = "performance.md"
 
@@ -47,12 +89,12 @@ class SplatConfig:
         matmul_precision: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
     """
 
-    near: Annotated[float, Range(0, 1e6)] = constants.NEAR
-    eps2d: Annotated[float, Range(0, 1e6)] = constants.EPS2D
-    alpha_min: Annotated[float, Range(1e-12, 1)] = constants.ALPHA_MIN
-    alpha_max: Share = constants.ALPHA_MAX
+    near: Annotated[float, Range(0, 1e6)] = NEAR
+    eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
+    alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
+    alpha_max: Share = ALPHA_MAX
     transmittance_stop: Share = knob(
-        constants.TRANSMITTANCE_STOP,
+        TRANSMITTANCE_STOP,
         cost="65 dB at 0.001, 45 dB at 0.01",
         gain="5 % of the time with gradients at 0.001, 13 % at 0.01",
         measured=MEASURED,
@@ -114,13 +156,13 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
         "near_exact": SplatConfig(radius_sigma=2.5, transmittance_stop=1e-3),
         "fast": SplatConfig(radius_sigma=1.75, transmittance_stop=3e-3),
         "inria": SplatConfig(
-            near=constants.INRIA_NEAR,
-            alpha_max=constants.INRIA_ALPHA_MAX,
-            jacobian_margin=constants.INRIA_JACOBIAN_MARGIN,
+            near=INRIA_NEAR,
+            alpha_max=INRIA_ALPHA_MAX,
+            jacobian_margin=INRIA_JACOBIAN_MARGIN,
             normalize_quats=False,
-            radius_sigma=constants.INRIA_RADIUS_SIGMA,
+            radius_sigma=INRIA_RADIUS_SIGMA,
             square=True,
-            tile_size=constants.INRIA_TILE_SIZE,
+            tile_size=INRIA_TILE_SIZE,
         ),
     },
     '; "as_trained" of Settings and Shot is SPLAT_PRESETS[avatar.rendering]',

@@ -1,35 +1,90 @@
 """Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad`.
 
-Projection, depth order, (tile, splat) pairs, lists by tile and compositing have a module each; `drawing` composes them,
-`buffers` sizes what they need. `reference` draws the same image by the definition. Gradients (reverse mode only) reach
-means, quats, scales, opacities, colors, deformations, the background, and K and cam_from_world of the camera.
+Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background. `reference` draws the same
+image by the definition. Gradients (reverse mode only) reach means, quats, scales, opacities, colors, deformations, the
+background, and K and cam_from_world of the camera.
+
+Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of transformations measures
+what its scene needs. A traced call takes `default_pairs`, or what `plan_buffers` has measured on a scene like its own. What does
+not fit is counted (`Rendering.overflow`), and eager calls raise `BufferOverflowError`.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
+from numbers import Real
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.core import Tracer
 
-from humangs_jax.core.array_types import Array, Bool
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.numerics import at_least_float32, safe_divide
+from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
-from humangs_jax.rendering import constants
-from humangs_jax.rendering.buffers import (
-    BufferOverflowError,
-    plan_buffers,
-    raise_on_overflow,
-    warn_of_overflow,
-    with_default_buffers,
-)
-from humangs_jax.rendering.drawing import Background, Rendering, draw, draw_views, with_background
+from humangs_jax.io.images import contact_sheet, named_color, png_bytes
+from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
+from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
+from humangs_jax.rendering.schedules import FEATURE_COUNT
+from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
+from humangs_jax.rendering.tiling import (
+    TileGrid,
+    count_pairs,
+    depth_order,
+    emit_pairs,
+    footprints_by,
+    sort_into_tiles,
+    take,
+    tiles_to_image,
+)
 
 __all__ = ["BufferOverflowError", "Rendering", "SplatConfig", "plan_buffers", "render", "render_views", "seen_from"]
+
+
+logger = logging.getLogger(__name__)
+
+PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
+"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
+x 1024, where its 16,384 tiles add another 5 each."""
+
+STEPS_PER_OCTAVE = 4
+"""Sizes that `round_up` knows per power of two."""
+
+
+@pytree_dataclass
+class Rendering(Batchable):
+    """One image of a set of Gaussians; with leading axes, a batch of images.
+
+    rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
+    colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
+    drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
+    differentiable; None unless `SplatConfig.visibility`.
+    """
+
+    rgb: Float[Array, "h w 3"]
+    alpha: Float[Array, "h w"]
+    depth: Float[Array, "h w"]
+    overflow: Int[Array, ""]
+    visibility: Float[Array, " g"] | None = None
+
+    def _repr_png_(self) -> bytes:
+        """The image, or those of a batch side by side, for notebooks."""
+        images = np.asarray(self.rgb)
+        return png_bytes(contact_sheet(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
+
+
+Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None
+"""(3,) RGB, three numbers in [0, 1], a CSS name or "#rrggbb"; None: white."""
+
+
+class BufferOverflowError(ValueError):
+    """A view needs larger buffers than its configuration has."""
 
 
 @checked_arguments
@@ -94,7 +149,7 @@ def seen_from(
     gaussians: Gaussians,
     cameras: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
-    threshold: float = constants.ALPHA_MIN,
+    threshold: float = ALPHA_MIN,
 ) -> Bool[Array, " g"]:
     """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
 
@@ -157,3 +212,233 @@ def _own(array, of):
 @_own.def_vmap
 def _own_in_batch(size, batched, array, of):
     return array if batched[0] else jnp.broadcast_to(array, (size, *array.shape)), True
+
+
+# One image -----------------------------------------------------------------------------------------------------------
+
+
+def with_background(
+    gaussians: Gaussians, cameras: Camera, background: Background
+) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
+    """What is drawn, in float32 at least. Raises: ValueError for a background that is no color."""
+    return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
+
+
+def _color(background, dtype):
+    if background is None:
+        return jnp.ones(3, dtype)
+    if isinstance(background, str):
+        return jnp.asarray(named_color(background), dtype)
+    if hasattr(background, "shape"):
+        color, fits = background, background.shape == (3,)
+    else:
+        color = background
+        fits = isinstance(background, Sequence) and len(background) == 3
+        fits = fits and all(isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background)
+    if not fits:
+        shown = f"shape {color.shape}" if hasattr(color, "shape") else repr(color)
+        raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}")
+    return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
+
+
+def draw_projected(
+    projected: ProjectedGaussians,
+    gaussians: Gaussians,
+    camera: Camera,
+    config: SplatConfig = DEFAULT_CONFIG,
+    background: Background = None,
+) -> Rendering:
+    """The second half of `render`, for use inside transformations.
+
+    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only opacities and colors
+    are read here. background: as `Background`.
+    """
+    gaussians, camera, background = with_background(gaussians, camera, background)
+    config = with_default_buffers(gaussians, camera, config)
+    rendering = _draw(projected, gaussians, camera, background, config)
+    warn_of_overflow(rendering.overflow, config)
+    return rendering
+
+
+def draw(gaussians: Gaussians, camera: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
+    """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
+    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config)
+
+
+def draw_views(gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
+    """`draw` for every camera of a batch, one after the other."""
+    return lax.map(lambda camera: draw(gaussians, camera, background, config), cameras)
+
+
+def _draw(projected, gaussians, camera, background, config: SplatConfig) -> Rendering:
+    if config.scale != 1:
+        small = dataclasses.replace(config, scale=1.0)
+        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small)
+        return _resized(drawn, camera)
+    grid = TileGrid(camera.width, camera.height, config.tile_size)
+    if gaussians.means.shape[0] == 0:
+        blank = jnp.zeros((grid.tiles, FEATURE_COUNT, grid.pixels), projected.x.dtype)
+        visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
+        return _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
+
+    depths = jnp.where(projected.visible, lax.stop_gradient(projected.depths), jnp.inf)
+    order = depth_order(depths)
+    opacities = projected.dimmed(gaussians.opacities)
+    footprints = footprints_by(projected, opacities, config)
+    footprints = jax.tree.map(lambda plane: take(plane, order), footprints)
+
+    # Depths are blended relative to the nearest: their gradient is a difference of depths, which must not drown in the
+    # rounding of depths.
+    nearest = jnp.min(depths)
+    nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
+    behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
+    seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
+    splats = pack_splats(projected, opacities, seen, config.alpha_min)
+    splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
+    features, transmittance, peaks, overflow = _draw_tiles(footprints, splats, grid, config)
+    visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
+    return _blended(features, transmittance, grid, background, nearest, overflow, visibility)
+
+
+def _draw_tiles(footprints, splats, grid: TileGrid, config: SplatConfig):
+    """Tiles of premultiplied features (t, 4, p) and the final T (t, 1, p), largest weights (g,), overflow.
+
+    Footprints and splats in depth order.
+    """
+    assert config.max_pairs is not None  # callers have fitted the buffers
+    pairs = emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs)
+    lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
+    features, transmittance, peaks = composite(splats, lists, grid, config)
+    return features, transmittance[:, None], lax.stop_gradient(peaks), pairs.overflow
+
+
+def _blended(features, transmittance, grid, background, nearest, overflow, visibility) -> Rendering:
+    """features: (t, 4, p) premultiplied rgb and z - nearest. transmittance: (t, 1, p) the final one.
+
+    Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor does its gradient.
+    """
+    alpha = 1 - transmittance
+    rgb = features[:, :3] + transmittance * background[:, None]
+    depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:], alpha), 0.0)
+    rgb, alpha, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
+    return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility)
+
+
+def _resized(rendering: Rendering, camera: Camera) -> Rendering:
+    """The image at the camera's size; depth is weighted by alpha."""
+    r = rendering
+    premultiplied = jnp.concatenate([r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]], axis=-1)
+    image = _resampled(_resampled(premultiplied, camera.height, 0), camera.width, 1)
+    alpha = image[..., 3]
+    return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility)
+
+
+def _resampled(image, size: int, axis: int):
+    """Linear interpolation between pixels along one axis, constant beyond the outer ones.
+
+    As `jax.image.resize`, whose matrix products take 14 times as long on a CPU.
+    """
+    count = image.shape[axis]
+    at = ((np.arange(size) + 0.5) * (count / size) - 0.5).clip(0, count - 1)
+    first = np.floor(at).astype(np.int32)
+    fraction = np.expand_dims(at - first, [i for i in range(image.ndim) if i != axis]).astype(image.dtype)
+    neighbours = (jnp.asarray(i) for i in (first, np.minimum(first + 1, count - 1)))
+    a, b = (jnp.moveaxis(take(jnp.moveaxis(image, axis, 0), i), 0, axis) for i in neighbours)
+    return a + fraction * (b - a)
+
+
+# Buffers -------------------------------------------------------------------------------------------------------------
+
+
+def round_up(size: int, smallest: int = 64) -> int:
+    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at most a fifth is spare."""
+    size = max(size, smallest)
+    unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
+    return -(-size // unit) * unit
+
+
+def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
+    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be needed.
+
+    g: Gaussians. width, height, tile_size: pixels.
+    """
+    tiles = TileGrid(width, height, tile_size).tiles
+    return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
+
+
+def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
+    """`config`, with `default_pairs` if it leaves `max_pairs` open; for traced calls."""
+    if config.max_pairs is not None:
+        return config
+    drawn = drawn_camera(camera, config)
+    pairs = default_pairs(gaussians.means.shape[0], drawn.width, drawn.height, config.tile_size)
+    return dataclasses.replace(config, max_pairs=pairs)
+
+
+@checked_arguments
+def plan_buffers(
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    margin: float = 1.25,
+) -> SplatConfig:
+    """`config` with buffers for one camera, or for the most demanding one of a batch, times `margin`.
+
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
+    call it outside of transformations.
+
+    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
+    `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
+    """
+    config = splat_config(config)
+    rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config))
+    return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
+
+
+def raise_on_overflow(overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> None:
+    """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
+    if missing := int(jnp.max(overflow, initial=0)):
+        rows, pairs = _needed(gaussians, cameras, config)
+        raise BufferOverflowError(
+            f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
+            f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
+        )
+
+
+def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
+    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks for it."""
+    if config.warn_overflow:  # else nothing is added to the program
+        warn = functools.partial(_warn, max_pairs=config.max_pairs, max_rows=config.max_rows)
+        jax.debug.callback(warn, jnp.max(overflow, initial=0))
+
+
+def _warn(missing, max_pairs, max_rows):
+    if missing > 0:
+        logger.warning(
+            "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s, max_rows = %s. Larger buffers: "
+            "plan_buffers with the Gaussians as they are now",
+            missing,
+            max_pairs,
+            max_rows,
+        )
+
+
+def _needed(gaussians, cameras, config):
+    """Most rows and most pairs that any of the views needs."""
+    gaussians, cameras = at_least_float32((gaussians, cameras))
+    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
+    return [int(most) for most in _count(gaussians, cameras, config)]
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _count(gaussians, cameras, config):
+    def one(camera):
+        projected = project_gaussians(gaussians, camera, config)
+        camera = drawn_camera(camera, config)
+        footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)
+        grid = TileGrid(camera.width, camera.height, config.tile_size)
+        return count_pairs(footprints, grid)
+
+    if not cameras.batch_shape:
+        return one(cameras)
+    return [jnp.max(most, initial=0) for most in lax.map(one, cameras)]

@@ -19,9 +19,8 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.parts import HumanGSOutputs, Variables
 from humangs_jax.network.stages import StageCaller, call
-from humangs_jax.rendering.drawing import draw_projected
 from humangs_jax.rendering.projection import project_gaussians
-from humangs_jax.rendering.splatting import Rendering
+from humangs_jax.rendering.splatting import Rendering, draw_projected
 from humangs_jax.training.config import TrainConfig
 
 RASTERIZED = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")

@@ -11,11 +11,10 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.reading import FileError
-from humangs_jax.rendering.constants import EPS2D, MIP_EPS2D
 from humangs_jax.rendering.gaussians import Gaussians, widened
 from humangs_jax.rendering.projection import project
 from humangs_jax.rendering.reference import render_reference
-from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D, SplatConfig
 from humangs_jax.rendering.splatting import render
 
 PIXEL = 0.0086

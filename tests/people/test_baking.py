@@ -13,7 +13,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.people import baking, cameras, rendering, subject, writer
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.rendering.mesh import atlas, rasterizer
-from humangs_jax.rendering.mesh.texturing import sample_texture
+from humangs_jax.rendering.mesh.rasterizer import sample_texture
 
 SIZE = 512
 LEAST_DENSITY = 0.4

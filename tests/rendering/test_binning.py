@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians
 
-from humangs_jax.rendering import binning
+from humangs_jax.rendering import tiling
 from humangs_jax.rendering.projection import project, squared_reach
 from humangs_jax.rendering.tiling import TileGrid
 
@@ -19,17 +19,17 @@ SAMPLES = 400
 
 @jax.jit
 def ellipses(gaussians):
-    return binning.footprints(project(gaussians, camera(np.float32)), squared_reach(gaussians.opacities))
+    return tiling.footprints(project(gaussians, camera(np.float32)), squared_reach(gaussians.opacities))
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def emit(footprints, max_rows, max_pairs):
-    return binning.emit_pairs(footprints, GRID, max_rows, max_pairs)
+    return tiling.emit_pairs(footprints, GRID, max_rows, max_pairs)
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def count(footprints, grid):
-    return binning.count_pairs(footprints, grid)
+    return tiling.count_pairs(footprints, grid)
 
 
 def least_distance(e, i, tile):
@@ -80,7 +80,7 @@ def test_overflow_counts_exactly_what_is_missing(max_rows, max_pairs):
 
 
 def test_counts_saturate():
-    huge = binning.Footprints(*(jnp.full(3000, x, jnp.float32) for x in (8192.0, 8192.0, 1e10, 0.0, 1e10, 1e20, 10.0)))
+    huge = tiling.Footprints(*(jnp.full(3000, x, jnp.float32) for x in (8192.0, 8192.0, 1e10, 0.0, 1e10, 1e20, 10.0)))
     rows, pairs = count(huge, TileGrid(16384, 16384, 16))  # 3000 x 2^20 tiles
     assert rows == 3000 * 1024 and pairs == 1 << 30
 
@@ -91,5 +91,5 @@ def test_depth_order_is_a_stable_argsort(count):
     depths = np.exp(rng.normal(size=count)).astype(np.float32)
     depths[rng.integers(0, count, count // 2)] = np.float32(1.5)  # ties
     depths[rng.integers(0, count, count // 4)] = np.inf
-    order = jax.jit(binning.depth_order)(jnp.asarray(depths))
+    order = jax.jit(tiling.depth_order)(jnp.asarray(depths))
     np.testing.assert_array_equal(order, np.argsort(depths, kind="stable"))

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from humangs_jax.rendering.buffers import round_up
+from humangs_jax.rendering.splatting import round_up
 
 
 @given(st.integers(0, 10**9))

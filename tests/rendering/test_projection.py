@@ -10,7 +10,7 @@ from splat_scenes import camera, few, random_gaussians
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import camera as pinhole
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.rendering import constants, projection
+from humangs_jax.rendering import projection, splat_config
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 from humangs_jax.rendering.projection import squared_reach
 
@@ -114,7 +114,7 @@ def test_zero_quaternion_is_the_identity_and_degenerate_scales_have_gradients():
 def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
     gaussians = few(random_gaussians(5), np.asarray([15]))
     beside = replace(gaussians, means=jnp.asarray([[2.0, 0.1, 0.2]]), deformations=None)
-    free, clamped = (project(beside, camera(), jacobian_margin=m) for m in (None, constants.INRIA_JACOBIAN_MARGIN))
+    free, clamped = (project(beside, camera(), jacobian_margin=m) for m in (None, splat_config.INRIA_JACOBIAN_MARGIN))
     assert clamped.xx[0] < 0.1 * free.xx[0]
     np.testing.assert_array_equal(clamped.x, free.x)  # the centre stays where it is
 

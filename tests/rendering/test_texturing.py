@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from humangs_jax.rendering.mesh.texturing import sample_texture
+from humangs_jax.rendering.mesh.rasterizer import sample_texture
 
 ROUNDING = 2e-6
 """Texel positions of up to 16 texels in float32, times color steps of up to 1."""

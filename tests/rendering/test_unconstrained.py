@@ -8,7 +8,7 @@ import pytest
 
 import humangs_jax as hg
 from humangs_jax.core.pytree import replace
-from humangs_jax.rendering.unconstrained import COLOR_MARGIN, OPACITY_MARGIN
+from humangs_jax.rendering.gaussians import COLOR_MARGIN, OPACITY_MARGIN
 
 ROUNDING = 2e-6
 """Of a logarithm and an exponential, a logit and a sigmoid, in float32."""

@@ -17,8 +17,7 @@ from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.data.preprocess.protocol import VERTICAL_FOV, intrinsics
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
-from humangs_jax.rendering.mesh.texturing import sample_texture
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, sample_texture
 
 AMBIENT, HEADLIGHT = 0.3, 0.7
 STEP = 1 << 15

@@ -5,7 +5,7 @@ normals. Where a chart folds over itself, the hidden faces become charts of thei
 front to back and back to front. Charts are placed as bitmaps, the largest first, at the first free place. All have one scale,
 times the density that the caller asks for.
 
-Texture coordinates follow `rendering.mesh.texturing`: u to the right, v up.
+Texture coordinates follow `rendering.mesh.rasterizer.sample_texture`: u to the right, v up.
 """
 
 import dataclasses
