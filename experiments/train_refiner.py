@@ -25,7 +25,7 @@ from tqdm import tqdm
 from experiments.harness import Run, entry
 from experiments.results import write_json
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.low_pass import without_low_pass
+from humangs_jax.avatar.animate import without_low_pass
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
-from humangs_jax.avatar.low_pass import with_low_pass
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
 from humangs_jax.core.array_types import Array, Float, Int, PyTree

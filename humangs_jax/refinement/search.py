@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.avatar.animate import with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
-from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.progress import bar as progress_bar
@@ -275,7 +275,7 @@ def steps(
 # What it is made of: the pure functions of `steps`, `learned` and `objective`, with buffers in which all fits ------------
 
 
-def stepped(task: Task, state: RefineState, view: int) -> RefineState:
+def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineState:
     """The state after a step on one photo."""
 
     def stepped(splat: SplatConfig) -> tuple[RefineState, Array]:

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.low_pass import with_low_pass_of
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.views import SubjectViews

@@ -8,7 +8,7 @@ from avatar_cases import two_balls
 
 from humangs_jax.avatar.animate import animate, skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import LIMIT, Light, light_terms, relit, surface_normals
+from humangs_jax.avatar.light import LIMIT, Light, light_terms, relit, surface_normals, turned_normals
 from humangs_jax.avatar.reconstruct import with_light
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
@@ -107,6 +107,17 @@ def test_what_says_nothing_about_the_light_gives_finite_numbers(change):
         avatar = replace(avatar, rest_vertices=jnp.ones_like(avatar.rest_vertices))
     light = with_light(avatar, in_pose(PHOTOS)).light
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(light))
+
+
+def test_normals_of_stretched_surfaces_stay_perpendicular_to_them():
+    rng = np.random.default_rng(1)
+    normals, linear = np.linalg.qr(rng.normal(size=(20, 3, 3)))[0], np.eye(3) + 0.4 * rng.normal(size=(20, 3, 3))
+    linear = linear * np.sign(np.linalg.det(linear))[:, None, None]
+    got = np.asarray(turned_normals(jnp.asarray(normals[:, :, 0], jnp.float32), jnp.asarray(linear, jnp.float32)))
+    tangents = linear @ normals[:, :, 1:]
+    cosines = np.einsum("gi,gij->gj", got, tangents / np.linalg.norm(tangents, axis=1, keepdims=True))
+    assert np.abs(cosines).max() < 1e-5 and np.abs(np.linalg.norm(got, axis=1) - 1).max() < 1e-6
+    assert (np.einsum("gi,gij,gj->g", got, linear, normals[:, :, 0]) > 0).all()
 
 
 def test_colors_stay_in_range_and_have_gradients():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from avatar_cases import two_balls
 
-from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.animate import pixel_sizes, skin, with_low_pass, without_low_pass
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.low_pass import with_low_pass, without_low_pass
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.reading import FileError
 from humangs_jax.rendering.gaussians import Gaussians, widened
@@ -95,6 +95,19 @@ def test_fine_things_weigh_the_same_in_small_images():
     larger, _ = weight(wide, 4096)
     assert larger < exact  # nothing becomes more opaque than it is
     assert weight(replace(wide, low_pass=jnp.full(1, 1.0)), 32)[0] > 20 * exact
+
+
+def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
+    """Also if their pixels are not square."""
+    rest, blank = BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)), jnp.zeros((1, 48, 48, 3))
+    K = intrinsics_from_fov(0.7, 48, 48) * jnp.asarray([[0.5], [1.0], [1.0]]) + jnp.zeros((3, 3)).at[0, 2].set(12.0)
+    cameras = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, K, 48, 48)
+    views = SubjectViews(blank, blank[..., 0], cameras, rest.rotations[None], rest.translation[None], jnp.zeros(2))
+    avatar = flat_avatar()
+    seen = project(skin(with_low_pass(avatar, pixel_sizes(avatar, views)), rest), cameras[0])
+    np.testing.assert_allclose(seen.dimming, 1.0, atol=ROUNDING)
+    smaller = with_low_pass(avatar, 0.5 * pixel_sizes(avatar, views))
+    assert project(skin(smaller, rest), cameras[0]).dimming.max() < 0.99
 
 
 def test_dimmed_splats_are_drawn_as_defined():

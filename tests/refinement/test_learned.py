@@ -164,7 +164,7 @@ def test_a_run_sees_the_signals_of_training(scene):
     avatar, photo, parameters, splat = scene
     pieces = photo_signals(parameters, avatar, photo, splat)[0]
     for got, wanted in zip(jax.tree.leaves(pieces), jax.tree.leaves(signals_of(scene)), strict=True):
-        np.testing.assert_allclose(got, wanted, atol=ROUNDING * np.abs(wanted).max())
+        np.testing.assert_allclose(got, wanted, atol=5 * ROUNDING * np.abs(wanted).max())
 
 
 def test_pixels_that_do_not_count_say_nothing(scene):

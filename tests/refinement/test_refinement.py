@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_avatar, toy_capture
 
+from humangs_jax.avatar.animate import pixel_sizes, with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.avatar.frames import capture_renderings, posed
-from humangs_jax.avatar.low_pass import pixel_sizes, with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.refinement import refine as refinement
@@ -187,7 +187,6 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
         ({"seconds": 0.0}, "seconds"),
         ({"visible": 0.0}, "visible"),
         ({"full_steps": 0}, "full_steps"),
-        ({"optimizer": "adamx"}, "optimizer"),
     ],
 )
 def test_wrong_settings_are_named(settings, named):

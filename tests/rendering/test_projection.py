@@ -10,9 +10,10 @@ from splat_scenes import camera, few, random_gaussians
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import camera as pinhole
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.rendering import projection, splat_config
+from humangs_jax.rendering import projection
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 from humangs_jax.rendering.projection import squared_reach
+from humangs_jax.rendering.splat_config import EPS2D, SPLAT_PRESETS
 
 project = jax.jit(projection.project, static_argnames=("near", "eps2d", "jacobian_margin"))
 
@@ -112,9 +113,16 @@ def test_zero_quaternion_is_the_identity_and_degenerate_scales_have_gradients():
 
 
 def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
-    gaussians = few(random_gaussians(5), np.asarray([15]))
-    beside = replace(gaussians, means=jnp.asarray([[2.0, 0.1, 0.2]]), deformations=None)
-    free, clamped = (project(beside, camera(), jacobian_margin=m) for m in (None, splat_config.INRIA_JACOBIAN_MARGIN))
+    """INRIA's is that of the point at 1.3 times half the field of view."""
+    ball = replace(few(random_gaussians(5), np.asarray([15])), deformations=None, scales=jnp.full((1, 3), 0.01))
+    view = camera()
+    view = replace(view, K=view.K.at[0, 2].set(view.width / 2), cam_from_world=jnp.eye(4))
+    beside = replace(ball, means=jnp.asarray([[2.0, 0.1, 0.2]]))
+    margin = SPLAT_PRESETS["inria"].jacobian_margin
+    free, clamped = (project(beside, view, jacobian_margin=m) for m in (None, margin))
+    focal = view.K[0, 0]
+    at = 1.3 * 0.5 * view.width / focal
+    np.testing.assert_allclose(clamped.xx[0], (0.01 * focal / 0.2) ** 2 * (1 + at**2) + EPS2D, rtol=FLOAT64)
     assert clamped.xx[0] < 0.1 * free.xx[0]
     np.testing.assert_array_equal(clamped.x, free.x)  # the centre stays where it is
 

@@ -13,7 +13,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers, render, seen_from
+from humangs_jax.rendering.splatting import _resampled, plan_buffers, render, seen_from
 
 FLOAT64 = 1e-9
 """float64 rounding, relative to the largest entry."""
@@ -124,6 +124,15 @@ def test_scale_draws_the_smaller_image():
         assert (
             plan_buffers(gaussians, view, knobs(scale=0.5)).max_pairs <= plan_buffers(gaussians, view, SMALL).max_pairs
         )
+
+
+@pytest.mark.parametrize(("size", "count"), [(7, 3), (8, 4), (5, 1)])
+def test_scaled_images_are_resized_linearly_about_pixel_centres(size, count):
+    image = jnp.asarray(np.random.default_rng(size).random((count, 3, 2)), jnp.float32)
+    expected = jax.image.resize(image, (size, 3, 2), "linear")
+    np.testing.assert_allclose(_resampled(image, size, 0), expected, atol=1e-6)
+    turned = _resampled(jnp.swapaxes(image, 0, 1), size, 1)
+    np.testing.assert_allclose(turned, jnp.swapaxes(expected, 0, 1), atol=1e-6)
 
 
 @pytest.mark.slow

@@ -16,7 +16,8 @@ from humangs_jax.body.model import shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.viewer import packing
+from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D
+from humangs_jax.viewer import page as packing
 
 STEP = 1 / 65535
 HALF = 0.5 * (1 + 1e-6)
@@ -80,6 +81,16 @@ def test_colors_beyond_one_and_flat_gaussians_are_kept():
     got = decoded(packing.pack(replace(avatar, gaussians=gaussians)))
     np.testing.assert_allclose(got["colors"], gaussians.colors, atol=2 * STEP)
     np.testing.assert_allclose(got["scales"], packing.SMALLEST_SCALE, rtol=1e-4)
+
+
+def test_the_page_adds_no_more_than_the_scales_lack():
+    avatar = small_avatar()
+    refined = replace(
+        avatar, gaussians=replace(avatar.gaussians, low_pass=jnp.full_like(avatar.gaussians.opacities, 0.004))
+    )
+    drawn = [packing.pack(x).header["splatting"] for x in (avatar, refined)]
+    assert [x["eps2d"] for x in drawn] == [EPS2D, MIP_EPS2D]
+    assert [x["low_pass"] for x in drawn] == pytest.approx([0.0, 0.004])
 
 
 @pytest.mark.parametrize("joints", [1, 3, 8, 20])
