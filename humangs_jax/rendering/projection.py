@@ -92,7 +92,7 @@ def project(
 
     Arguments: near: metres. eps2d: pixels^2, see `added_variance`. jacobian_margin: None for the exact Jacobian; a number
     clamps the point where it is evaluated, to that fraction of the half field of view beyond the border
-    (`INRIA_JACOBIAN_MARGIN`). normalize_quats: False uses quaternions without normalising them.
+    (INRIA: 0.3). normalize_quats: False uses quaternions without normalising them.
     """
     eps2d = added_variance(gaussians, eps2d)
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]

@@ -74,10 +74,6 @@ def _reference(gaussians, camera, background, config):
     return Rendering(color + transmittance[..., None] * background, alpha, depth, jnp.int32(0))
 
 
-render_dense = render_reference
-"""The name by which other packages know such a renderer."""
-
-
 def _project(gaussians, camera, config):
     """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
 

@@ -1,4 +1,10 @@
-"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a pytree without leaves."""
+"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a pytree without leaves.
+
+Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
+(https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat (https://github.com/nerfstudio-project/gsplat). Ours
+are gsplat's where they differ, except that nothing is cut at three standard deviations: a footprint ends where its alpha falls
+below `ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
+"""
 
 import dataclasses
 from typing import Annotated, Literal
@@ -8,9 +14,7 @@ import jax
 from humangs_jax.core.configuration import Chunk, Presets, Range, Share, Slots, Spread, configuration, knob
 
 NEAR = 0.01
-"""Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA `INRIA_NEAR`."""
-
-INRIA_NEAR = 0.2
+"""Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA 0.2."""
 
 EPS2D = 0.3
 """Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a Gaussian thinner than a
@@ -28,27 +32,13 @@ ALPHA_MIN = 1 / 255
 """A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
 
 ALPHA_MAX = 0.999
-"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat 0.999; INRIA `INRIA_ALPHA_MAX`."""
-
-INRIA_ALPHA_MAX = 0.99
+"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat 0.999; INRIA 0.99."""
 
 TRANSMITTANCE_STOP = 1e-4
 """A pixel ends before the splat that would leave a transmittance T <= this. The same everywhere."""
 
-INRIA_JACOBIAN_MARGIN = 0.3
-"""INRIA and gsplat evaluate the projection's Jacobian no farther out than this fraction of the half field of view
-beyond the image's border: it bounds the footprints of Gaussians beside a near camera, at the price of a wrong shape
-there."""
-
-INRIA_RADIUS_SIGMA = 3.0
-"""Standard deviations after which INRIA cuts a square around a splat (gsplat: 3.33); visible for opaque splats."""
-
 LARGEST_FOOTPRINT = 1e9
 """Pixels; a Gaussian with a longer projected axis is not drawn. Its square's square would overflow float32."""
-
-INRIA_TILE_SIZE = 16
-"""Pixels. It matters where a square cuts splats off: they are drawn on whole tiles."""
-
 
 MEASURED = "performance.md"
 
@@ -56,88 +46,83 @@ MEASURED = "performance.md"
 @jax.tree_util.register_static
 @configuration
 class SplatConfig:
-    """What is drawn, in which buffers, on which schedule. docs/performance.md gives what each knob costs and gains.
-
-    What is drawn (see `constants` for reasons and for the numbers of other rasterizers):
-        near: metres; nearer Gaussians are not drawn. eps2d: pixels^2 added to the projected variances.
-        alpha_min: alphas below are skipped. alpha_max: alphas are clamped to it.
-        transmittance_stop: a pixel ends before its transmittance would fall to this.
-        jacobian_margin: None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat.
-        normalize_quats: False: quaternions are not normalised, as in INRIA's rasterizer.
-        opacity_min: Gaussians of lower opacity are not drawn at all.
-
-    Where footprints end. A splat is drawn on whole tiles, all that its footprint meets.
-        radius_sigma: standard deviations; None: where alpha falls below alpha_min, so that nothing is lost. Smaller values draw
-        faster and cut splats off at the borders of tiles: the image then depends on tile_size.
-        square: INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard
-        deviation, rounded up to pixels, at tiles as INRIA counts them.
-
-    What is computed:
-        scale: the image is drawn at this fraction of its resolution, and resized (bilinear).
-        visibility: whether `Rendering.visibility` is computed.
-
-    Buffers: capacities for (splat, tile) pairs, `max_pairs`, and for (splat, row of tiles) pairs, `max_rows`.
-        None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and takes
-        `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
-        `buffers.plan_buffers` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
-        practice; smaller is a little faster.
-        warn_overflow: traced calls log a warning whenever something did not fit. It adds a callback to the program.
-
-    Schedule: changes the time, not the image (but for rounding).
-        tile_size: pixels. block: tiles that are composited together. chunk, chunk_backward: splats of a list taken at
-        once (block and chunks: on CPUs only).
-        matmul_precision: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
+    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule. docs/performance.md gives what
+    each knob costs and gains.
     """
 
     near: Annotated[float, Range(0, 1e6)] = NEAR
+    """Metres; nearer Gaussians are not drawn."""
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
+    """Pixels^2 added to the projected variances."""
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
+    """Alphas below are skipped."""
     alpha_max: Share = ALPHA_MAX
+    """Alphas are clamped to it."""
     transmittance_stop: Share = knob(
         TRANSMITTANCE_STOP,
         cost="65 dB at 0.001, 45 dB at 0.01",
         gain="5 % of the time with gradients at 0.001, 13 % at 0.01",
         measured=MEASURED,
     )
+    """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
+    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat."""
     normalize_quats: bool = True
+    """False: quaternions are not normalised, as in INRIA's rasterizer."""
     opacity_min: Share = knob(0.0, cost="61 dB at 0.1, 38 dB at 0.4", gain="8 % of the time at 0.4", measured=MEASURED)
+    """Gaussians of lower opacity are not drawn at all."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
         None,
         cost="54 dB at 2.5, 44 dB at 2, 36 dB at 1.5; splats are cut at tile borders",
         gain="16 %, 28 %, 39 % of the time",
         measured=MEASURED,
     )
+    """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its footprint meets. None: where
+    alpha falls below alpha_min, so that nothing is lost. Smaller values draw faster; the image then depends on tile_size."""
     square: bool = False
+    """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard deviation,
+    rounded up to pixels, at tiles as INRIA counts them."""
     scale: Annotated[float, Range(1e-3, 16)] = knob(
         1.0, cost="36 dB at 0.5", gain="a fifth of the time at 0.5 (not of projection and sorting)", measured=MEASURED
     )
+    """The image is drawn at this fraction of its resolution, and resized (bilinear)."""
     visibility: bool = knob(
         False,
         cost="memory of one number a Gaussian",
         gain="`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.51 of the time at 52.6 dB",
         measured=MEASURED,
     )
+    """Whether `Rendering.visibility` is computed."""
     max_pairs: Slots | None = knob(
         None,
         cost="pairs beyond it are not drawn, counted and reported",
         gain="memory, one compilation",
         measured=MEASURED,
     )
+    """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and
+    takes `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
+    measures a capacity for such calls."""
     max_rows: Slots | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
+    """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""
     warn_overflow: bool = False
+    """Traced calls log a warning whenever something did not fit. It adds a callback to the program."""
     tile_size: Annotated[int, Range(1, 4096)] = knob(
         8, cost="none", gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time", measured=MEASURED
     )
+    """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding)."""
     block: Chunk = knob(32, cost="none", gain="within 4 % from 16 to 64 on CPUs", measured=MEASURED)
+    """Tiles that are composited together; on CPUs only."""
     chunk: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
+    """Splats of a list taken at once; on CPUs only."""
     chunk_backward: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
+    """Likewise with gradients."""
     matmul_precision: Literal["float32", "bfloat16"] = knob(
         "float32",
         cost="8e-4 of the gradient",
         gain="none on CPUs; meant for accelerators, not timed there",
         measured=MEASURED,
     )
+    """Of the gradient's sums over pixels: "bfloat16" rounds their factors to 8 bits."""
 
     def __post_init__(self):
         if not self.alpha_min < self.alpha_max < 1:
@@ -156,13 +141,15 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
         "near_exact": SplatConfig(radius_sigma=2.5, transmittance_stop=1e-3),
         "fast": SplatConfig(radius_sigma=1.75, transmittance_stop=3e-3),
         "inria": SplatConfig(
-            near=INRIA_NEAR,
-            alpha_max=INRIA_ALPHA_MAX,
-            jacobian_margin=INRIA_JACOBIAN_MARGIN,
+            near=0.2,
+            alpha_max=0.99,
+            # the Jacobian is evaluated no farther out than this fraction of the half field of view beyond the border: it bounds
+            # the footprints of Gaussians beside a near camera, at the price of a wrong shape there
+            jacobian_margin=0.3,
             normalize_quats=False,
-            radius_sigma=INRIA_RADIUS_SIGMA,
+            radius_sigma=3.0,  # gsplat: 3.33; visible for opaque splats
             square=True,
-            tile_size=INRIA_TILE_SIZE,
+            tile_size=16,  # matters where a square cuts splats off: they are drawn on whole tiles
         ),
     },
     '; "as_trained" of Settings and Shot is SPLAT_PRESETS[avatar.rendering]',

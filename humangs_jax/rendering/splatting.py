@@ -111,7 +111,7 @@ def render(
     checked. Pairs that do not fit are not drawn there, and are counted in `Rendering.overflow`; `SplatConfig.warn_overflow` logs
     them. Loops that draw often jit `render`, which saves both checks.
 
-    After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079), with gsplat's conventions (see `constants`).
+    After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079), with gsplat's conventions (see `splat_config`).
     """
     if camera.batch_shape:
         raise ValueError(
