@@ -280,7 +280,9 @@ def inner(a, b):
     return sum(float(np.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-def check_gradients(case):
+@pytest.mark.slow
+@pytest.mark.parametrize("case", (*FAST, *SLOW), ids=str)
+def test_gradients_agree_with_differences(case):
     function, point, fixed = compiled(case, jnp.float64)
     (loss, facts), gradients = jax.device_get(function(point, fixed))
     assert int(facts["overflow"]) == int(facts["dropped"]) == 0
@@ -307,18 +309,6 @@ def check_gradients(case):
             if errors[-1] < AGREEMENT:
                 break
         assert errors[-1] < AGREEMENT, f"{group}: {errors}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", FAST, ids=str)
-def test_gradients_agree_with_differences(case):
-    check_gradients(case)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", SLOW, ids=str)
-def test_gradients_agree_with_differences_however_configured(case):
-    check_gradients(case)
 
 
 def turned_away(cameras):
@@ -372,7 +362,11 @@ DEGENERATE = (
 )
 
 
-def check_degenerate(case, degenerate, dtype):
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+@pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("case", FAST, ids=str)
+def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate, dtype):
     function, point, fixed = compiled(case, dtype)
     (loss, facts), gradients = jax.device_get(function(*degenerate(case, point, fixed)))
     assert np.isfinite(loss)
@@ -383,20 +377,6 @@ def check_degenerate(case, degenerate, dtype):
     if culled:  # nothing that only images tell of has a gradient
         assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_cameras"]))
         assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("case", FAST, ids=str)
-def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate):
-    check_degenerate(case, degenerate, jnp.float64)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("case", FAST, ids=str)
-def test_gradients_are_finite_in_float32_too(case, degenerate):
-    check_degenerate(case, degenerate, jnp.float32)
 
 
 @pytest.mark.slow
