@@ -31,10 +31,9 @@ from experiments.timing import medians, peak_rss_mb
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import transform
-from humangs_jax.rendering import binning
+from humangs_jax.rendering import schedules, tiling
 from humangs_jax.rendering.compositing import pack_splats
 from humangs_jax.rendering.projection import project, squared_reach
-from humangs_jax.rendering.schedules import fat_chunks, small_blocks
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import SplatConfig, plan_buffers, render, render_views
 from humangs_jax.rendering.tiling import TileGrid, image_to_tiles, sort_into_tiles, tiles_to_image
@@ -108,7 +107,7 @@ BACKWARD = ("cotangents", "composite backward", "project backward")
 def stages(scene: Scene, config: Any) -> dict[str, Any]:
     """Functions without arguments, by stage, in the order of the work. One device, exact footprints."""
     on_cpu = jax.default_backend() == "cpu"
-    schedule, runs = small_blocks if on_cpu else fat_chunks, {}
+    order_of_work, runs = "blocks" if on_cpu else "chunks", {}
 
     def stage(name, function, *arguments):
         program = jax.jit(function, compiler_options=compiler_options())
@@ -117,7 +116,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
         return program(*arguments)
 
     def footprints(projected, opacities, order):
-        ellipses = binning.footprints(projected, squared_reach(opacities, config.alpha_min))
+        ellipses = tiling.footprints(projected, squared_reach(opacities, config.alpha_min))
         return jax.tree.map(lambda plane: plane[order], ellipses)
 
     def rows(projected, gaussians, order):
@@ -131,16 +130,18 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     gaussians, camera = scene.gaussians(), scene.camera()
     grid = TileGrid(scene.size, scene.size, config.tile_size)
     projected = stage("project", lambda g: project(g, camera), gaussians)
-    order = stage("depth order", binning.depth_order, projected.depths)
+    order = stage("depth order", tiling.depth_order, projected.depths)
     pairs = stage(
         "pairs",
-        lambda *a: binning.emit_pairs(footprints(*a), grid, config.max_rows, config.max_pairs),
+        lambda *a: tiling.emit_pairs(footprints(*a), grid, config.max_rows, config.max_pairs),
         *(projected, gaussians.opacities, order),
     )
     count = len(scene.means)
     lists = stage("lists", lambda *a: sort_into_tiles(*a, grid.tiles, count), pairs.tiles, pairs.splats)
     splats = stage("rows", rows, projected, gaussians, order)
-    features, transmittance, used, _ = stage("composite", schedule.forward(grid, config), splats, *lists)
+    features, transmittance, used, _ = stage(
+        "composite", getattr(schedules, f"forward_by_{order_of_work}")(grid, config), splats, *lists
+    )
     stage("image", lambda f, t: (tiles_to_image(f, grid), tiles_to_image(t[:, None], grid)), features, transmittance)
 
     image = jnp.asarray(make_target(scene.size) / scene.size**2)
@@ -151,7 +152,6 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
         return g, jnp.sum(g * features, axis=1)
 
     g, total = stage("cotangents", cotangents, image, features)
-    backward = schedule.backward(grid, config)
     sums = stage("composite backward", backward, splats, lists.items, lists.starts, used, g, total)
     stage(
         "project backward",
