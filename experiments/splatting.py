@@ -139,9 +139,10 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     count = len(scene.means)
     lists = stage("lists", lambda *a: sort_into_tiles(*a, grid.tiles, count), pairs.tiles, pairs.splats)
     splats = stage("rows", rows, projected, gaussians, order)
-    features, transmittance, used, _ = stage(
-        "composite", getattr(schedules, f"forward_by_{order_of_work}")(grid, config), splats, *lists
+    forward, backward = (
+        getattr(schedules, f"{way}_by_{order_of_work}")(grid, config) for way in ("forward", "backward")
     )
+    features, transmittance, used, _ = stage("composite", forward, splats, *lists)
     stage("image", lambda f, t: (tiles_to_image(f, grid), tiles_to_image(t[:, None], grid)), features, transmittance)
 
     image = jnp.asarray(make_target(scene.size) / scene.size**2)
