@@ -38,8 +38,7 @@ from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import needed_reads, project_and_test, view_weights
 from humangs_jax.network.weights import expected_variables, load_weights
 from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
-from humangs_jax.rendering.buffers import round_up
-from humangs_jax.rendering.splatting import render
+from humangs_jax.rendering.splatting import render, round_up
 
 DISTANCE_FACTOR = 1.8
 """The nearest of the published protocol (1.8 to 2.2)."""

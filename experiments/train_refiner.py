@@ -2,8 +2,8 @@
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
 ten views, four of them those photos. A step draws samples and a number of photos for each, runs the iterations, and compares the
-result of each iteration with views that are not among the photos. Gradients pass through the iterations, but not through the errors
-that an iteration sees. Validation is on other people.
+result of each iteration with views that are not among the photos. Gradients pass through the iterations, but not through the
+errors that an iteration sees. Validation is on other people.
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ from tqdm import tqdm
 
 from experiments.harness import Run, entry
 from experiments.results import write_json
-from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.animate import without_low_pass
+from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose

@@ -114,7 +114,7 @@ class Conventions:
     Gaussians between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`);
     None: all with their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: metres
     that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
-    (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
+    (`avatar.animate`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
     decimated, and metres to which their edges are split afterwards; None for neither.
     """
 

@@ -29,7 +29,7 @@ class Gaussians(Batchable):
     means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
     opacities: (g,) in [0, 1]. colors: (g, 3) RGB in [0, 1], as images have them (sRGB-encoded).
     deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
-    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.low_pass`).
+    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.animate`).
     Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what this makes larger in images of larger pixels.
     """
 

@@ -44,8 +44,8 @@ from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 from humangs_jax.people.bank import PeopleBank
 from humangs_jax.refinement.refine import Refinement
-from humangs_jax.rendering.drawing import Rendering
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training import config
 from humangs_jax.training.validation import METRICS
 
