@@ -1,4 +1,4 @@
-"""What the scripts of this folder share: the variants that are trained, how one is trained and scored, and the paper's numbers.
+"""What the experiments of the paper share: the variants that are trained, how one is trained and scored, printed numbers.
 
 Every variant is a `TrainConfig` that differs from another one in what its name says. All see the same people, views and targets
 in the same order, have the same losses and number of steps, and are compared on the same views of the same unseen people.
@@ -10,10 +10,35 @@ import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "paper.md"
+import jax
+from scipy.stats import t
+
+from experiments.results import REPOSITORY, write_json
+from experiments.systems import ONE_PHOTO as TAKE_ONE
+from experiments.systems import SYSTEMS
+from experiments.systems.grouped import GroupReader
+from experiments.systems.pixel_queries import QueryDecoder
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.targets import show_targets
+from humangs_jax.data.loader import ViewSampling
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.evaluation.cases import Predicted, draw_views
+from humangs_jax.evaluation.run import evaluate
+from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.losses.loss_networks import load_loss_networks
+from humangs_jax.network.config import paper_parts
+from humangs_jax.network.upsampler import UpsamplerConfig
+from humangs_jax.network.weights import load_weights
+from humangs_jax.people.writer import Layout, write_set
+from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.loop import TrainingInterrupted, train
+from humangs_jax.training.optimizer import OptimizerConfig
+from humangs_jax.training.sources import cached_people
+from humangs_jax.training.validation import validate, validation_examples
+
+PAGE = REPOSITORY / "docs" / "paper.md"
 SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}
 PHOTOS, TARGETS = 4, 6
 """Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
@@ -90,12 +115,6 @@ class Variant(NamedTuple):
 
 def variants(steps: int) -> dict[str, Variant]:
     """All that `train_all.py` trains, by name, in the order of its queue."""
-    from experiments.systems import ONE_PHOTO, SYSTEMS
-    from humangs_jax.data.loader import ViewSampling
-    from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.upsampler import UpsamplerConfig
-    from humangs_jax.training.config import LossConfig, TrainConfig
-    from humangs_jax.training.optimizer import OptimizerConfig
 
     def run(model: Any, photos: int = PHOTOS, **fields: Any) -> Any:
         capacity = -(-model.runtime.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
@@ -153,7 +172,7 @@ def variants(steps: int) -> dict[str, Variant]:
     }
     for name, model in systems.items():
         if name not in ("humangs", "back_projection", "cross_attention", *PER_PERSON):
-            alone = name in ONE_PHOTO
+            alone = name in TAKE_ONE
             against = "humangs, 1 photo" if alone else "humangs"
             found[name] = Variant(run(model, 1 if alone else PHOTOS), against, "systems")
     return found
@@ -174,12 +193,6 @@ def train_variant(
     people: a `sources.MakeSource`; body: the model of theirs and of `validation`, a `CaptureCache`. Returns scores by number of
     photos, steps, parameters, CPU and wall seconds of all calls.
     """
-    import jax
-
-    from experiments.common.results import write_json
-    from humangs_jax.data.views import gaussian_body
-    from humangs_jax.training.loop import TrainingInterrupted, train
-
     clock = out / "seconds.json"
     before = json.loads(clock.read_text()) if clock.exists() else {"cpu": 0.0, "wall": 0.0}
     cpu, wall = time.process_time(), time.perf_counter()
@@ -210,9 +223,6 @@ def train_variant(
 
 def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> dict[str, float]:
     """Means over people of `TARGETS` views each, with that number of photos."""
-    from humangs_jax.training.sources import cached_people
-    from humangs_jax.training.validation import validate, validation_examples
-
     compared = dataclasses.replace(
         config,
         model=config.model.with_runtime(token_capacity=0),
@@ -240,8 +250,6 @@ def seed_interval(rows: Mapping[str, Any], score: str = "psnr_fg") -> float | No
     found = [headline(rows[a])[score] - headline(rows[b])[score] for a, b in pairs if b in rows]
     if not found:
         return None
-    from scipy.stats import t
-
     return float(t.ppf(0.975, len(found))) * math.sqrt(sum(x * x for x in found) / len(found))
 
 
@@ -276,28 +284,37 @@ def untrained_on_the_page() -> list[str]:
 QUICK_PEOPLE, QUICK_SIZE = 2, 128
 
 
-def add_people_options(parser: Any) -> None:
-    """Options of the scripts that compare trained systems."""
-    parser.add_argument("--runs", type=Path, help="the OUT of train_all.py; without it the shipped weights alone")
-    parser.add_argument("--people", type=Path, help="captures with held_out/, or any data set (docs/datasets.md)")
-    parser.add_argument("--body", type=Path, help="body model of a data set")
-    parser.add_argument("--lpips", type=Path, nargs="+", help="weights of LPIPS vgg: BACKBONE and HEADS")
-    parser.add_argument("--quick", action="store_true", help="two synthetic people of 128 pixels, made in a minute")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """Options:
+    runs: the OUT of `paper`; without it the shipped weights alone
+    people: captures with held_out/, or any data set (docs/datasets.md)
+    body: body model of a data set
+    lpips: weights of LPIPS vgg: BACKBONE and HEADS
+    quick: two synthetic people of 128 pixels, made in a minute
+    """
+
+    runs: Path | None = None
+    people: Path | None = None
+    body: Path | None = None
+    lpips: tuple[Path, ...] = ()
+    quick: bool = False
+
+    def with_people(self, folder: Path) -> Self:
+        """With the small people made in a folder, if none were given. Raises: ValueError where neither is asked for."""
+        if not (self.people or self.quick):
+            raise ValueError("--people is needed, or --quick")
+        return self if self.people else dataclasses.replace(self, people=quick_people(folder / "people"))
 
 
 def quick_people(folder: Path, split: str = "test") -> Path:
     """Small synthetic captures: 12 photos of one pose, held-out views of it and of another pose."""
-    from humangs_jax.people.writer import Layout, write_set
-
     write_set(folder, QUICK_PEOPLE, Layout(QUICK_SIZE, views=12, held_out_views=2, novel_poses=1), split)
     return folder
 
 
 def load_networks(paths: Any) -> tuple[Any, ...]:
     """LPIPS for the evaluator, or nothing."""
-    from humangs_jax.losses.loss_networks import load_loss_networks
-
     found = load_loss_networks(None, paths[0], paths[1] if len(paths) > 1 else None, "vgg").lpips if paths else None
     return () if found is None else (found,)
 
@@ -309,8 +326,6 @@ def folder_of(name: str) -> str:
 
 def trained(runs: Path | None, names: Any = None) -> dict[str, tuple[Any, Any]]:
     """(variables, configuration) by name: the variants whose training is finished, and the shipped weights."""
-    from humangs_jax.network.weights import load_weights
-
     found = {}
     if runs is not None:
         finished = json.loads((runs / "results.json").read_text())["runs"]
@@ -327,9 +342,6 @@ def measured(
     None if the system takes no such number of photos. The first person is run twice, and only the second run is timed: the first
     one compiles.
     """
-    from humangs_jax.evaluation.run import evaluate
-    from humangs_jax.evaluation.tables import mean_scores
-
     config = weights[1]
     if takes_one(config) and photos > 1:
         return None
@@ -360,12 +372,6 @@ def measured(
 
 def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple[Any, float, float]:
     """What a system shows of a `Case`, as `Predicted`; seconds to model, 0 if it runs for each target, and to draw all views."""
-    import jax
-
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.avatar.targets import show_targets
-    from humangs_jax.evaluation.cases import Predicted, draw_views
-
     start = modelled = time.perf_counter()
     if weights[1].architecture.runs_per_target:
         images, alpha = show_targets(*weights, case.inputs, case.truth, background)
@@ -378,16 +384,12 @@ def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple
 
 def takes_one(config: Any) -> bool:
     """Whether a system refuses a second photo."""
-    from experiments.systems.grouped import GroupReader
-
     reader = config.architecture.reader
     return isinstance(reader, GroupReader) or getattr(reader, "most_views", None) == 1
 
 
 def animatable(config: Any) -> bool:
     """Whether a system can show a pose that no photo shows: LVSM knows no body."""
-    from experiments.systems.pixel_queries import QueryDecoder
-
     decoder = config.architecture.decoder
     return not (isinstance(decoder, QueryDecoder) and decoder.texture is None)
 

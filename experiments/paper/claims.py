@@ -1,21 +1,9 @@
-"""The paper's claims beside what docs/results says of them: the first table of docs/paper.md. Measures nothing.
+"""The paper's claims beside what docs/results says of them. Measures nothing."""
 
-    python experiments/paper/claims.py --page
-
-A verdict is one of three. Of the differences that a claim is about, the 95 % intervals by the seeds of training
-(`bench.seed_interval`) lie all on the paper's side: "consistent at toy scale"; one lies on the other side: "contradicted at toy
-scale"; else, or where a system that the claim needs is not trained: "not tested". A contradiction by a system that is not
-trained is called one, and says so. Contradictions come first.
-"""
-
-import argparse
-import sys
 from collections.abc import Collection
-from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, publish
+from experiments.harness import Run, entry
 from experiments.paper.bench import (
     ANIMATION,
     DOMAINS,
@@ -24,7 +12,6 @@ from experiments.paper.bench import (
     HUMANRAM,
     NOT_TRAINED,
     OURS,
-    PAGE,
     PAINTED_TABLE,
     RECONSTRUCTION,
     SHIPPED,
@@ -34,8 +21,8 @@ from experiments.paper.bench import (
     seed_interval,
     untrained,
 )
+from experiments.results import markdown_table
 
-TABLE = "paper_claims"
 GIGA_SPLIT = "HumanGS, on GIGA's split"
 CONTRADICTED, CONSISTENT, NOT_TESTED = "contradicted at toy scale", "consistent at toy scale", "not tested"
 VERDICTS = CONTRADICTED, CONSISTENT, NOT_TESTED
@@ -52,27 +39,27 @@ class Claim(NamedTuple):
     why: str = ""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {TABLE} of this page")
-    arguments = parser.parse_args()
+@entry
+def paper_claims(run: Run) -> None:
+    """The paper's claims beside what docs/results says of them. Measures nothing.
+
+    A verdict is one of three. Of the differences that a claim is about, the 95 % intervals by the seeds of training lie all on
+    the paper's side: "consistent at toy scale"; one lies on the other side: "contradicted at toy scale"; else, or where a system
+    that the claim needs is not trained: "not tested". A contradiction by a system that is not trained is called one, and says
+    so.
+    """
     numbers = Numbers()
     rows = sorted(claims(numbers), key=lambda row: VERDICTS.index(row.verdict))
     lines = [[row.claim, row.paper, row.measured, row.verdict + (f": {row.why}" if row.why else "")] for row in rows]
     half = f"+-{numbers.interval['psnr_fg']:.2f} dB of foreground PSNR and +-{numbers.interval['psnr']:.2f} dB of PSNR"
-    text = "\n\n".join(
-        [
-            markdown_table(["claim", "what the paper says", "what we measured", "holds?"], lines, "llll"),
-            f"Intervals: {half}, at 95 %, by two pairs of seeds, from four photos of the validation people, and taken for all "
-            "rows. They do not cover other people. Our own additions:",
-            markdown_table(["without it, on the bench", "foreground PSNR"], additions(numbers), "ll"),
-        ]
-    )
-    print(text)
-    if arguments.page:
-        held = {"interval": numbers.interval, "untrained": numbers.gray, "verdicts": {x.claim: x.verdict for x in rows}}
-        publish(arguments.page, TABLE, text, held)
+    texts = [
+        markdown_table(["claim", "what the paper says", "what we measured", "holds?"], lines, "llll"),
+        f"Intervals: {half}, at 95 %, by two pairs of seeds, from four photos of the validation people, and taken for all "
+        "rows. They do not cover other people. Our own additions:",
+        markdown_table(["without it, on the bench", "foreground PSNR"], additions(numbers), "ll"),
+    ]
+    held = {"interval": numbers.interval, "untrained": numbers.gray, "verdicts": {x.claim: x.verdict for x in rows}}
+    run.show("\n\n".join(texts), held)
 
 
 class Numbers:
@@ -286,7 +273,7 @@ def of_people(n: Numbers) -> list[Claim]:
         Claim(
             "people of one source driven by motions of another",
             "images",
-            "`paper/figures.py --figure driven`",
+            "`paper_figures --only driven`",
             NOT_TESTED,
             "it is skinning, and works with any weights",
         ),
@@ -313,7 +300,3 @@ def printed(a: str, b: str) -> str:
     """What the tables of reconstruction say of two systems."""
     sets = {"THuman2.1": (DOMAINS, 0), "THuman4.0": (RECONSTRUCTION, 0), "AvatarReX": (DOMAINS, 1)}
     return ", ".join(f"{name} {pair(table[a][i], table[b][i])}" for name, (table, i) in sets.items())
-
-
-if __name__ == "__main__":
-    main()

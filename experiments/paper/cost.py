@@ -1,35 +1,31 @@
-"""The paper's central claim, measured: vertices that are projected into the photos against vertices that attend to all tokens.
+"""The paper's central claim, measured: vertices that are projected into the photos against vertices that attend to all tokens."""
 
-    python experiments/paper/cost.py --page docs/paper.md --image docs/images/paper_cost.png
-
-The two readers of `experiments.systems` "back_projection" and "cross_attention", alone, on maps of the same width: forward passes
-over views, vertices and image sizes, in turns. Time is CPU time of all threads. Operations of attention are products of matrices,
-counted in the compiled program; back-projection has none: its weighted sums of four neighbours count as 8 a vertex, view and
-feature. Memory is what the program needs besides arguments and results. All patches are tokens, as in the paper.
-
-Then the operations of whole networks in published sizes, counted in programs that are not run. Of LHM and its kin the joint
-attention of points and tokens alone is counted, with the 40,000 points and 4,096 + 1,024 tokens a photo of the paper: the two
-pretrained networks that make the tokens, and the decoder, come on top. 4 CPU minutes. --networks counts these again and keeps the
-readers of the page. Expected: attention grows with vertices times tokens, back-projection with vertices times views, not with the
-size of the photos.
-"""
-
-import argparse
 import functools
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import REPOSITORY, add_outputs, markdown_table, significant, write_outputs
 from experiments.costs import costs_of, temporary_mb
+from experiments.harness import Run, entry, figure
 from experiments.paper.bench import ANIMATION, FASTER_MODELLING, OURS
-from experiments.timing import medians, prepare_process
+from experiments.results import REPOSITORY, markdown_table, significant
+from experiments.systems import SYSTEMS, back_projection
+from experiments.systems.cross_attention import CrossAttentionReader
+from experiments.systems.two_stream import TwoStreamReader, TwoStreams
+from experiments.timing import medians
+from humangs_jax.body.library import load_body
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.network.humangs import apply_humangs
+from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.network.parts import Encoding
+from humangs_jax.network.runtime import Runtime
+from humangs_jax.network.weights import expected_variables
 
-TABLE = "paper_cost"
 PATCH, READ_OPERATIONS = 8, 8
 """Operations of one bilinear read and its sum over views, per feature: four products, four additions."""
 AXES = {"views": (1, 2, 4, 8, 16), "vertices": (1000, 3000, 10000, 40000), "size": (128, 256, 512)}
@@ -43,55 +39,64 @@ POINTS, TOKENS = 40000, 4096 + 1024
 """Of LHM: points of the body, tokens of the body's photo and of the head's. LHM++ has its own, which we do not know."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--width", type=int, default=128, help="features of maps, vertices and attention")
-    parser.add_argument("--repeats", type=int, default=3, help="timed iterations")
-    parser.add_argument(
-        "--networks", action="store_true", help="count the networks alone; readers: as docs/results has them"
-    )
-    parser.add_argument("--quick", action="store_true", help="the smallest sizes alone, no whole networks: for tests")
-    add_outputs(parser, TABLE)
-    parser.add_argument("--image", type=Path, help="draw them here (.png)")
-    arguments = parser.parse_args()
-    prepare_process()
-    if arguments.networks:
-        record = json.loads((REPOSITORY / "docs" / "results" / f"{TABLE}.json").read_text())
+@entry
+def paper_cost(
+    run: Run,
+    width: int = 128,
+    repeats: int = 3,
+    networks: bool = False,
+    quick: bool = False,
+    image: Path | None = None,
+) -> None:
+    """The paper's central claim: vertices that are projected into the photos against vertices that attend to all tokens.
+
+    The two readers of `experiments.systems`, alone, on maps of the same width: forward passes over views, vertices and image
+    sizes, in turns. Operations of attention are products of matrices; back-projection has none: its weighted sums of four
+    neighbours count as 8 a vertex, view and feature. All patches are tokens, as in the paper. Then the operations of whole
+    networks in published sizes, counted in programs that are not run. Of LHM and its kin the joint attention of points and
+    tokens alone is counted, without the two pretrained networks that make the tokens and the decoder. 4 CPU minutes.
+
+    Options:
+    width: features of maps, vertices and attention
+    repeats: timed iterations
+    networks: count the networks alone; readers: as docs/results has them
+    quick: the smallest sizes alone, no whole networks
+    image: draw them here (.png)
+    """
+    if networks:
+        record = json.loads((REPOSITORY / "docs" / "results" / f"{run.table}.json").read_text())
         measured_then = {key: record[key] for key in ("date", "machine", "versions")}
         result = {"readers": measured_then} | record["numbers"] | {"networks": all_networks()}
     else:
-        result = measure(arguments)
-    write_outputs(arguments, TABLE, text_of(result), result)
-    if arguments.image:
-        draw(result, arguments.image)
+        middle = {"views": 1, "vertices": 1000, "size": 64} if quick else MIDDLE
+        axes = {name: AXES[name][:2] for name in ("views", "vertices")} if quick else AXES
+        cases = [middle | {axis: value} for axis, values in axes.items() for value in values]
+        each = {" ".join(map(str, case.values())): functools.partial(compare, width, repeats, **case) for case in cases}
+        by_name = {" ".join(map(str, case.values())): case for case in cases}
+        rows = [by_name[name] | row for name, row in run.rows(each, {"width": width, "repeats": repeats}).items()]
+        result = {"rows": rows, "middle": middle, "width": width, "networks": {} if quick else all_networks()}
+    run.show(text_of(result), result)
+    if image:
+        plot(image, result)
 
 
-def measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Everything that the JSON holds."""
-    import jax
-
-    middle = {"views": 1, "vertices": 1000, "size": 64} if arguments.quick else MIDDLE
-    axes = {name: values[:2] if arguments.quick else values for name, values in AXES.items()}
-    cases = [
-        middle | {axis: value}
-        for axis, values in axes.items()
-        if not (arguments.quick and axis == "size")
-        for value in values
-    ]
-    rows = []
-    for case in (case for i, case in enumerate(cases) if case not in cases[:i]):
-        rows.append({**case, **compare(arguments.width, arguments.repeats, **case)})
-        print(" ".join(f"{key} {value}" for key, value in case.items()), rows[-1], flush=True)
-        jax.clear_caches()
-    return {
-        "rows": rows,
-        "middle": middle,
-        "width": arguments.width,
-        "networks": {} if arguments.quick else all_networks(),
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
-    }
+def plot(path: Path, result: dict[str, Any]) -> None:
+    """CPU time against views, vertices and the side of the photos."""
+    with figure(path, len(AXES), (11, 3.6)) as all_axes:
+        for axes, axis in zip(all_axes, AXES, strict=True):
+            others = {key: value for key, value in result["middle"].items() if key != axis}
+            same = [row for row in result["rows"] if all(row[key] == value for key, value in others.items())]
+            rows = sorted(same, key=lambda row: row[axis])
+            values = [row[axis] for row in rows]
+            for name, color in READERS.items():
+                axes.loglog(values, [row[name]["cpu_ms"] for row in rows], "o-", color=color, label=name)
+            axes.set_xticks(values, [str(value) for value in values])
+            axes.minorticks_off()
+            title = ", ".join(f"{value} px" if key == "size" else f"{value} {key}" for key, value in others.items())
+            axes.set(xlabel={"size": "side of the photos, pixels"}.get(axis, axis))
+            axes.set_title(title, fontsize=9)
+        all_axes[0].set_ylabel("CPU ms")
+        all_axes[0].legend(fontsize=8)
 
 
 def all_networks() -> dict[str, dict[str, float]]:
@@ -102,8 +107,6 @@ def all_networks() -> dict[str, dict[str, float]]:
 
 def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> dict[str, dict[str, float]]:
     """CPU ms, operations and temporary MiB of both readers on the same maps."""
-    import jax
-
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
@@ -118,24 +121,14 @@ def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> d
             "operations": costs_of(traced).flops + sums,
             "temporary_mb": temporary_mb(program),
         }
-        runs[name] = functools.partial(wait, program, variables, encoding, inputs)
+        runs[name] = lambda p=program, v=variables: jax.block_until_ready(p(v, encoding, inputs))
     for name, (wall, cpu) in medians(runs, repeats).items():
         found[name] |= {"ms": float(wall), "cpu_ms": float(cpu)}
     return found
 
 
-def wait(program: Any, *arguments: Any) -> None:
-    """Run it to the end."""
-    import jax
-
-    jax.block_until_ready(program(*arguments))
-
-
 def configurations(width: int, size: int) -> dict[str, Any]:
     """The networks whose readers are compared."""
-    from experiments.systems import back_projection
-    from experiments.systems.cross_attention import CrossAttentionReader
-
     config = back_projection("bench").with_conventions(image_size=size, tokens="all")
     reader = CrossAttentionReader(width, layers=1, head_width=32)
     return {"back-projection": config, "cross-attention": config.with_parts(reader=reader)}
@@ -143,12 +136,6 @@ def configurations(width: int, size: int) -> dict[str, Any]:
 
 def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]:
     """(inputs, encoding): points on a cylinder of the size of a person, cameras around it, maps of noise."""
-    import jax.numpy as jnp
-
-    from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-    from humangs_jax.network.inputs import HumanGSInputs
-    from humangs_jax.network.parts import Encoding
-
     rng = np.random.default_rng(0)
     angles, heights = rng.uniform(-np.pi, np.pi, vertices), rng.uniform(-0.9, 0.9, vertices)
     normals = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
@@ -180,14 +167,6 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
 
 def network_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of a whole network in its published size, counted in the program before its compilation."""
-    import jax
-
-    from experiments.systems import SYSTEMS
-    from humangs_jax.body.library import load_body
-    from humangs_jax.data.views import gaussian_body
-    from humangs_jax.network.humangs import apply_humangs
-    from humangs_jax.network.weights import expected_variables
-
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_runtime(dtype="float32")
     vertices = len(gaussian_body(load_body(), config).template)
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
@@ -203,13 +182,6 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
 
 def joint_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of the attention of an LHM-style system in its published size, with LHM's points and tokens."""
-    import jax
-    import jax.numpy as jnp
-
-    from experiments.systems import SYSTEMS
-    from experiments.systems.two_stream import TwoStreamReader, TwoStreams
-    from humangs_jax.network.runtime import Runtime
-
     reader = SYSTEMS[name]("published").architecture.reader
     assert isinstance(reader, TwoStreamReader)
     streams = TwoStreams(reader, Runtime())
@@ -278,39 +250,3 @@ def text_of(result: dict[str, Any]) -> str:
             markdown_table(["network", "photos", "vertices or points", "M parameters", "TFLOP", "over HumanGS"], lines),
         ]
     return "\n\n".join(texts)
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    """CPU time against views, vertices and the side of the photos."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, all_axes = plt.subplots(1, len(AXES), figsize=(11, 3.6), layout="constrained")
-    for axes, axis in zip(all_axes, AXES, strict=True):
-        others = {key: value for key, value in result["middle"].items() if key != axis}
-        rows = sorted(
-            (row for row in result["rows"] if all(row[key] == value for key, value in others.items())),
-            key=lambda row: row[axis],
-        )
-        for name, color in READERS.items():
-            axes.loglog(
-                [row[axis] for row in rows], [row[name]["cpu_ms"] for row in rows], "o-", color=color, label=name
-            )
-        values = [row[axis] for row in rows]
-        axes.set_xticks(values, [str(value) for value in values])
-        axes.minorticks_off()
-        axes.set_xlabel({"size": "side of the photos, pixels"}.get(axis, axis))
-        axes.set_title(
-            ", ".join(f"{value} {key}" if key != "size" else f"{value} px" for key, value in others.items()), fontsize=9
-        )
-        axes.grid(alpha=0.3)
-    all_axes[0].set_ylabel("CPU ms")
-    all_axes[0].legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-
-
-if __name__ == "__main__":
-    main()

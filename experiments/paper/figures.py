@@ -1,46 +1,40 @@
-"""The paper's figures, of trained variants.
+"""The paper's figures, of trained variants; those that are not trained are left out, with a line that says so."""
 
-    python experiments/paper/figures.py --runs runs/paper --people PEOPLE --out figures
-    python experiments/paper/figures.py --quick --out figures --figure varying driven          # with the shipped weights
-
-varying   PSNR of unseen poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many
-token     PSNR with and without the global token over 1, 2, 4, 6 and 8 photos; the paper: a gain at 1 and 2, none from 4 on
-features  histogram of what the features of four depths change in a patch of 64 x 64 pixels (at 512; in proportion otherwise) more
-          than half of which is the person: LPIPS where --lpips is given, squared error otherwise; the paper: a positive skew
-driven    people of --people in the poses of other people (--motions; of each other without)
-systems   the first person by every system of the bench that is trained (docs/paper.md says which are not): a view in the pose of
-          the photos, and one in a pose that no photo shows
-
-Variants that are not trained are left out, with a line that says so.
-"""
-
-import argparse
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import check_section, markdown_table, publish, write_json
+from experiments.harness import Run, entry, figure
 from experiments.paper.bench import (
     ABLATIONS,
     ONE_PHOTO,
-    PAGE,
     PHOTOS,
     SHIPPED,
     VIEW_COUNTS,
-    add_people_options,
+    Tested,
     load_networks,
     measured,
-    quick_people,
     shown,
     takes_one,
     trained,
     untrained_on_the_page,
 )
+from experiments.results import markdown_table
+from humangs_jax.avatar.frames import draw
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.evaluation.cases import find_people, weights_method
+from humangs_jax.io.images import write_png
+from humangs_jax.losses.perceptual import lpips
 
 TOKENS = ("humangs", "no global token")
 DEPTHS = ("features of the last layer", "features of four depths")
@@ -50,36 +44,37 @@ SHOWN = 4
 """People, and poses, on the sheet of driven people."""
 ACROSS = 8
 """Systems side by side, before the next ones are below."""
-PAGE_TABLE = "paper_figures"
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_people_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the images")
-    parser.add_argument("--motions", type=Path, help="captures whose poses drive the others")
-    parser.add_argument("--varying", type=Path, help="captures of several poses, for `varying`; default: --people")
-    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {PAGE_TABLE} of this page")
-    parser.add_argument("--figure", nargs="+", default=list(FIGURES), choices=tuple(FIGURES), help="which ones")
-    arguments = parser.parse_args()
-    if not (arguments.people or arguments.quick):
-        parser.error("--people is needed, or --quick")
-    try:
-        if arguments.page:
-            check_section(arguments.page, PAGE_TABLE)
-        with tempfile.TemporaryDirectory() as folder:
-            if arguments.people is None:
-                arguments.people = quick_people(Path(folder) / "people")
-            systems, networks = trained(arguments.runs), load_networks(arguments.lpips)
-            arguments.out.mkdir(parents=True, exist_ok=True)
-            numbers = {name: FIGURES[name](systems, networks, arguments) for name in arguments.figure}
-            if arguments.json:
-                write_json(arguments.json, numbers)
-            if arguments.page:
-                publish(arguments.page, PAGE_TABLE, text_of(numbers), numbers)
-    except (ValueError, OSError) as error:
-        parser.error(str(error))
+@entry
+def paper_figures(
+    run: Run,
+    out: Path,
+    options: Tested = Tested(),
+    motions: Path | None = None,
+    poses: Path | None = None,
+    only: tuple[str, ...] = (),
+) -> None:
+    """The paper's figures, of trained variants.
+
+    varying: PSNR of unseen poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; token: PSNR
+    with and without the global token over photos; features: histogram of what the features of four depths change in a patch of
+    64 x 64 pixels of 512 more than half of which is the person (LPIPS where --lpips is given, squared error otherwise); driven:
+    people in the poses of other people; systems: the first person by every system of the bench that is trained.
+
+    Options:
+    out: folder of the images
+    motions: captures whose poses drive the others; default: each other
+    poses: captures of several poses, for `varying`; default: --people
+    only: which figures
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        options = options.with_people(Path(folder))
+        systems, networks = trained(options.runs), load_networks(options.lpips)
+        out.mkdir(parents=True, exist_ok=True)
+        given = SimpleNamespace(**vars(options), out=out, motions=motions, varying=poses)
+        numbers = {name: FIGURES[name](systems, networks, given) for name in only or FIGURES}
+    run.show(text_of(numbers), numbers)
 
 
 def text_of(numbers: Mapping[str, Any]) -> str:
@@ -109,7 +104,7 @@ def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> boo
     return not missing
 
 
-def varying(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, dict[int, float]]:
+def varying(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, dict[int, float]]:
     """Unseen poses from photos of varying poses."""
     people = arguments.varying or arguments.people
     curves: dict[str, dict[int, float]] = {}
@@ -125,9 +120,6 @@ def varying(systems: dict[str, Any], networks: Any, arguments: argparse.Namespac
 
 def varied(people: Path, count: int) -> dict[str, dict[str, list[int]]] | None:
     """Views of as many frames as there are, in turns, for captures without held_out/; None: as the evaluator chooses."""
-    from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.loading.captures import find_captures
-
     chosen = {}
     for folder in find_captures(people) if people.is_dir() else []:
         if (folder / "held_out").is_dir():
@@ -139,7 +131,7 @@ def varied(people: Path, count: int) -> dict[str, dict[str, list[int]]] | None:
     return chosen or None
 
 
-def token(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, dict[int, float]]:
+def token(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, dict[int, float]]:
     """With and without the global token."""
     curves: dict[str, dict[int, float]] = {}
     if present(systems, TOKENS, "token"):
@@ -156,15 +148,8 @@ def token(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace)
     return curves
 
 
-def features(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, float]:
+def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, float]:
     """What the features of four depths change, by patches."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from humangs_jax.evaluation.cases import find_people, weights_method
-
     if not present(systems, DEPTHS, "features"):
         return {}
     people, changes = find_people(arguments.people, PHOTOS, None, arguments.body), []
@@ -178,11 +163,10 @@ def features(systems: dict[str, Any], networks: Any, arguments: argparse.Namespa
             side = max(1, truth.shape[0] // PATCHES)
             error = patch_lpips(networks[0]) if networks else patch_error
             changes += [error(truth, a, box) - error(truth, b, box) for box in patches(mask, side)]
-    figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
-    axes.hist(changes, bins=60, color="#1f6f8b")
-    axes.axvline(0, color="black", linewidth=0.8)
-    axes.set_xlabel(f"{'LPIPS' if networks else 'squared error'} without - with features of four depths")
-    figure.savefig(arguments.out / "features.png", dpi=110)
+    with figure(arguments.out / "features.png", size=(5, 3.4)) as axes:
+        axes.hist(changes, bins=60, color="#1f6f8b")
+        axes.axvline(0, color="black", linewidth=0.8)
+        axes.set_xlabel(f"{'LPIPS' if networks else 'squared error'} without - with features of four depths")
     centred = np.asarray(changes) - np.mean(changes)
     skew = float(np.mean(centred**3) / max(np.mean(centred**2) ** 1.5, 1e-30))
     return {"patches": len(changes), "mean": float(np.mean(changes)), "skewness": skew}
@@ -204,25 +188,12 @@ def patch_error(truth: np.ndarray, shown: np.ndarray, box: tuple[slice, slice]) 
 
 def patch_lpips(network: Any) -> Callable[..., float]:
     """LPIPS of a patch."""
-    import jax
-
-    from humangs_jax.losses.perceptual import lpips
-
     compare = jax.jit(lpips)
     return lambda truth, shown, box: float(compare(network, shown[box], truth[box]))
 
 
-def driven(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, list[str]]:
+def driven(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, list[str]]:
     """A row a person: one photo, then the person in poses of others, seen from the camera of that photo."""
-    import jax
-    import jax.numpy as jnp
-
-    from humangs_jax.avatar.frames import draw
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.core.pytree import replace
-    from humangs_jax.evaluation.cases import find_people
-    from humangs_jax.io.images import write_png
-
     weights = systems.get("humangs", systems[SHIPPED])
     people = find_people(arguments.people, PHOTOS, None, arguments.body)
     others = find_people(arguments.motions, PHOTOS, None, arguments.body) if arguments.motions else people
@@ -247,15 +218,8 @@ def driven(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace
     return {"people": list(people.names[:SHOWN])}
 
 
-def systems_shown(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, list[str]]:
+def systems_shown(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, list[str]]:
     """A column a system, the truth first."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from humangs_jax.evaluation.cases import find_people
-
     left_out = {SHIPPED, *untrained_on_the_page()}  # the shipped weights were trained far longer
     names = [name for name in systems if name not in left_out and not any(mark in name for mark in ABLATIONS)]
     columns: dict[str, Any] = {}
@@ -269,44 +233,30 @@ def systems_shown(systems: dict[str, Any], networks: Any, arguments: argparse.Na
         columns[f"{name}\n{photos} photo{'s' * (photos > 1)}"] = [predicted.images[view] for view in views]
     rows, width = len(columns["truth"]), min(len(columns), ACROSS)
     blocks = -(-len(columns) // width)
-    figure, axes = plt.subplots(
-        blocks * rows, width, figsize=(1.3 * width, 1.6 * blocks * rows), layout="constrained", squeeze=False
-    )
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for i, (title, images) in enumerate(columns.items()):
-        column = axes[i // width * rows :, i % width]
-        column[0].set_title(title, fontsize=7)
-        for axis, image in zip(column, images, strict=False):
-            axis.imshow(np.clip(image, 0, 1))
-    figure.savefig(arguments.out / "systems.png", dpi=130)
+    with figure(arguments.out / "systems.png", width, (1.3 * width, 1.6 * blocks * rows), rows=blocks * rows) as axes:
+        for axis in axes.flat:
+            axis.set_axis_off()
+        for i, (title, images) in enumerate(columns.items()):
+            column = axes[i // width * rows :, i % width]
+            column[0].set_title(title, fontsize=7)
+            for axis, image in zip(column, images, strict=False):
+                axis.imshow(np.clip(image, 0, 1))
     return {"systems": names}
 
 
 def draw_curves(curves: dict[str, dict[int, float]], path: Path, label: str) -> None:
     """PSNR over numbers of photos."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
-    for name, points in curves.items():
-        axes.plot(list(points), list(points.values()), "o-", label=name)
-    axes.set_xlabel(label)
-    axes.set_ylabel("PSNR, dB")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    with figure(path, size=(5, 3.4)) as axes:
+        for name, points in curves.items():
+            axes.plot(list(points), list(points.values()), "o-", label=name)
+        axes.set(xlabel=label, ylabel="PSNR, dB")
+        axes.legend(fontsize=8)
 
 
-FIGURES: dict[str, Callable[[dict[str, Any], Any, argparse.Namespace], Any]] = {
+FIGURES: dict[str, Callable[[dict[str, Any], Any, Any], Any]] = {
     "varying": varying,
     "token": token,
     "features": features,
     "driven": driven,
     "systems": systems_shown,
 }
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,3 @@
-import importlib.util
 import os
 import pickle
 import sys
@@ -11,6 +10,8 @@ import numpy as np
 import pytest
 import scipy.sparse
 
+from experiments.harness import call
+from experiments.paper import release
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
@@ -46,31 +47,19 @@ def made_up_file(n=9, columns=20, seed=0):
     }
 
 
-def check_script():
-    path = Path(__file__).parents[2] / "experiments" / "paper" / "check_body.py"
-    spec = importlib.util.spec_from_file_location("check_body", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_agrees_with_the_public_package_in_every_hand_convention():
-    script = check_script()
-    rows = script.compare(MODEL, ARRAYS)
+    rows = release.compare_body(MODEL, ARRAYS)
     assert {convention for convention, *_ in rows} == {"axis_flat", "axis_mean", "pca12_mean"}
     assert len(rows) == 6
-    assert max(max(errors) for _, _, *errors in rows) < script.TOLERANCE
+    assert max(max(errors) for _, _, *errors in rows) < release.TOLERANCE
 
 
-def test_check_script_fails_on_other_numbers(tmp_path, monkeypatch, capsys):
+def test_the_check_fails_on_other_numbers(tmp_path, capsys):
     arrays = dict(np.load(ARRAYS))
     arrays["axis_mean_joints"] = arrays["axis_mean_joints"] + 2e-5
     np.savez(tmp_path / "other.npz", **arrays)
     for path, status in ((tmp_path / "other.npz", 1), (ARRAYS, 0)):
-        monkeypatch.setattr(sys, "argv", ["check_body.py", str(MODEL), str(path), "--float32"])
-        with pytest.raises(SystemExit) as stop:
-            check_script().main()
-        assert stop.value.code == status
+        assert call(release.check_body, [str(MODEL), str(path), "--float32"]) == status
     assert "FAILED" in capsys.readouterr().out
 
 

@@ -2,11 +2,11 @@
 
 import argparse
 import json
-import sys
 
 import numpy as np
 import pytest
 
+from experiments.harness import call
 from experiments.paper import bench, claims, cost, figures, tables, train_all
 
 
@@ -76,7 +76,9 @@ def test_the_page_of_the_paper_says_what_the_results_say():
     numbers = claims.Numbers()
     said = {row.claim: row.verdict for row in claims.claims(numbers)}
     assert set(said.values()) == set(claims.VERDICTS)
-    assert said == bench.results(claims.TABLE)["verdicts"] and numbers.gray == bench.results(claims.TABLE)["untrained"]
+    assert (
+        said == bench.results("paper_claims")["verdicts"] and numbers.gray == bench.results("paper_claims")["untrained"]
+    )
     page = bench.PAGE.read_text()
     assert page.index(claims.CONTRADICTED, page.index("| holds? |")) < page.index(
         claims.CONSISTENT, page.index("| holds? |")
@@ -85,11 +87,11 @@ def test_the_page_of_the_paper_says_what_the_results_say():
 
 
 def test_runs_of_other_settings_are_not_mixed(tmp_path):
-    path, parser = tmp_path / "results.json", argparse.ArgumentParser()
-    assert train_all.kept(path, {"steps": 1}, parser) == {}
+    path = tmp_path / "results.json"
+    assert train_all.kept(path, {"steps": 1}) == {}
     path.write_text('{"settings": {"steps": 2}, "runs": {}}')
-    with pytest.raises(SystemExit):
-        train_all.kept(path, {"steps": 1}, parser)
+    with pytest.raises(ValueError, match="other settings"):
+        train_all.kept(path, {"steps": 1})
 
 
 def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
@@ -104,7 +106,7 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
     arguments = argparse.Namespace(people=tmp_path, other=[], near=None, split=None, fits=tmp_path / "fits.json")
     arguments.gray = []
     fit = {"animation": {"psnr": 21.0, "ssim": 0.9, "lpips_vgg": None}, "fit_s": 300.0, "frame_s": 0.5}
-    arguments.fits.write_text(json.dumps({"a": fit, "b": fit | {"fit_s": 500.0}}))
+    arguments.fits.write_text(json.dumps({"numbers": {"paper_fits": {"a": fit, "b": fit}}}))
     texts = {name: table(["humangs", "lhm"], measure, arguments) for name, table in tables.TABLES.items()}
     assert "| humangs | 4 photos | 24.00 / 0.900 / - |  |  |" in texts["animation"]
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
@@ -133,15 +135,6 @@ def test_other_kinds_of_people_are_columns_and_another_split_a_row(tmp_path):
     assert "| HumanGS | paper | 30.81 / 0.980 / 0.024 | 27.27 / 0.970 / 0.033 |  |" in text
 
 
-def test_rows_of_tables_are_kept_for_the_same_settings_alone(tmp_path):
-    path = tmp_path / "tables.json"
-    assert tables.kept(None, {}) == tables.kept(path, {}) == {}
-    path.write_text('{"settings": {"people": ["a"]}, "rows": {"humangs, a, 4": null}}')
-    assert tables.kept(path, {"people": ["a"]}) == {"humangs, a, 4": None}
-    with pytest.raises(ValueError, match="rows of other settings"):
-        tables.kept(path, {"people": ["b"]})
-
-
 def test_a_cost_table_has_the_ratio_of_the_readers():
     readers = {
         "back-projection": {"cpu_ms": 2.0, "operations": 1e7, "temporary_mb": 1.0},
@@ -162,12 +155,11 @@ def test_a_cost_table_has_the_ratio_of_the_readers():
 
 
 @pytest.mark.slow
-def test_the_cost_of_the_readers_is_measured(tmp_path, monkeypatch):
+def test_the_cost_of_the_readers_is_measured(tmp_path):
     files = tmp_path / "cost.json", tmp_path / "cost.png"
-    command = ["cost.py", "--quick", "--repeats", "1", "--json", str(files[0]), "--image", str(files[1])]
-    monkeypatch.setattr(sys, "argv", command)
-    cost.main()
-    rows = json.loads(files[0].read_text())["rows"]
+    options = ["--quick", "--repeats", "1", "--json", str(files[0]), "--image", str(files[1])]
+    assert call(cost.paper_cost, options) == 0
+    rows = json.loads(files[0].read_text())["numbers"]["paper_cost"]["rows"]
     assert [(row["views"], row["vertices"]) for row in rows] == [(1, 1000), (2, 1000), (1, 3000)]
     attention = [row["cross-attention"]["operations"] for row in rows]
     tokens, width = 8 * 8, 128
@@ -187,12 +179,9 @@ def test_patches_are_those_that_the_person_fills():
 
 
 def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are(tmp_path, monkeypatch):
-    from humangs_jax.data import capture
-    from humangs_jax.data.loading import captures
-
     frames = argparse.Namespace(frames=np.repeat([0, 1, 2], 4))
-    monkeypatch.setattr(captures, "find_captures", lambda folder: [folder / "person"])
-    monkeypatch.setattr(capture, "load_capture", lambda folder: frames)
+    monkeypatch.setattr(figures, "find_captures", lambda folder: [folder / "person"])
+    monkeypatch.setattr(figures, "load_capture", lambda folder: frames)
     chosen = figures.varied(tmp_path, 4)["person"]
     assert frames.frames[chosen["context"]].tolist() == [0, 1, 0, 1] and len(set(chosen["context"])) == 4
     assert frames.frames[chosen["target"]].tolist() == [2] * 4  # an unseen pose
