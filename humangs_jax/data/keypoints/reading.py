@@ -10,10 +10,10 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.capture_checks import CaptureError, few
 from humangs_jax.data.formats import KEYPOINTS
 from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Keypoints, Source
-from humangs_jax.data.keypoints.sets import COCO_17, KeypointSet
+from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
@@ -34,12 +34,11 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".h
 
 
 class Person(NamedTuple):
-    """points: (k, 2) pixels, centres at +0.5, finite. confidences: (k,) in [0, 1]. Counts as in `Keypoints`."""
+    """values: (k, 3) pixels with centres at +0.5, finite, and confidences in [0, 1]. Counts as in `Keypoints`."""
 
-    points: Float[np.ndarray, "k 2"]
-    confidences: Float[np.ndarray, " k"]
-    not_finite: int
-    far_outside: int
+    values: Float[np.ndarray, "k 3"]
+    not_finite: int = 0
+    far_outside: int = 0
 
 
 def read_detections(path: Path) -> Detections:
@@ -114,21 +113,43 @@ def read_keypoints(
         return _read(path, names, width, height, person)
 
 
-def _read(path, names, width, height, person):
+def _read(path: Path, names: Sequence[str], width: int, height: int, person: int | None) -> Keypoints:
     detections = read_detections(path)
-    if detections.set is None:
+    if (kind := detections.set) is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
-    people = [
-        None if image is None else _chosen_person(image, name, person, detections, width, height)
-        for image, name in zip(images, names, strict=True)
-    ]
-    if person is not None and not any(people):
-        most = max(len(image.people) for image in images if image is not None)
+    body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
+    people, most, nobody = [], 0, Person(np.zeros((len(kind.names), 3)))
+    for image, name in zip(images, names, strict=True):
+        seen = () if image is None else image.people
+        found = [_usable(each, detections.offset, width, height, image, name) for each in seen if image is not None]
+        most = max(most, len(found))
+        if (
+            image is not None
+            and person is None
+            and (clear := sum(_is_clear(each.values[body, 2]) for each in found)) > 1
+        ):
+            choice = "Person I is the I-th of each view, counted from 0 in the order of the file"
+            problem = f"{clear} people: expected one. {choice}; or crop the photos, or delete the others from the file"
+            raise CaptureError(image.file, f"view {name}", problem)
+        if person is not None:
+            people.append(found[person] if person < len(found) else nobody)
+        else:
+            people.append(max(found, key=lambda each: each.values[:, 2].sum(), default=nobody))
+    if person is not None and person >= most:
         raise CaptureError(path, f"person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}")
-    keypoints = _assemble(people, detections.set, names)
+    values = np.stack([each.values for each in people]).astype(np.float32)
+    keypoints = Keypoints(
+        values[..., :2],
+        values[..., 2],
+        kind,
+        missing=tuple(name for name, row in zip(names, values[..., 2], strict=True) if not row.any()),
+        not_finite=sum(each.not_finite for each in people),
+        far_outside=sum(each.far_outside for each in people),
+        shifted=_shifted(images, names),
+    )
     _check_pixels(path, keypoints)
-    return dataclasses.replace(keypoints, shifted=_shifted(images, names))
+    return keypoints
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
@@ -165,29 +186,9 @@ def _images_of_views(
             raise CaptureError(image.file, f"size of {image.image}", problem)
         images[view] = image
     if not any(images):
-        named = _few([str(image.image) for image in detections.images])
-        problem = f"images {named} are none of the views {_few(list(names))}: expected the same names"
-        raise CaptureError(path, "", problem)
+        named = few([str(image.image) for image in detections.images])
+        raise CaptureError(path, "", f"images {named} are none of the views {few(names)}: expected the same names")
     return images
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f", ... ({len(names)})" if len(names) > 3 else "")
-
-
-def _assemble(people: Sequence[Person | None], keypoint_set: KeypointSet, names: Sequence[str]) -> Keypoints:
-    count = len(keypoint_set.names)
-    nobody = Person(np.zeros((count, 2), np.float32), np.zeros(count, np.float32), 0, 0)
-    filled = [nobody if each is None else each for each in people]
-    confidences = np.stack([each.confidences for each in filled])
-    return Keypoints(
-        points=np.stack([each.points for each in filled]),
-        confidences=confidences,
-        set=keypoint_set,
-        missing=tuple(name for name, row in zip(names, confidences, strict=True) if not row.any()),
-        not_finite=sum(each.not_finite for each in filled),
-        far_outside=sum(each.far_outside for each in filled),
-    )
 
 
 def _check_pixels(path: Path, keypoints: Keypoints) -> None:
@@ -203,57 +204,25 @@ def _check_pixels(path: Path, keypoints: Keypoints) -> None:
 # Which person ---------------------------------------------------------------------------------------------------------
 
 
-def _chosen_person(
-    image: DetectedImage, view: str, person: int | None, detections: Detections, width: int, height: int
-) -> Person | None:
-    """The one person of a view, or the one asked for by number; None if there is none.
-
-    Raises: CaptureError if there are several and no number was given, or if confidences are not in [0, 1].
-    """
-    field = f"view {view}"
-    people = [_usable(each, detections.offset, width, height, image, field) for each in image.people]
-    if person is not None:
-        return people[person] if person < len(people) else None
-    assert detections.set is not None  # `_read` has checked it
-    body = np.asarray([name in TRUNK_AND_LIMBS for name in detections.set.names])
-    clear = sum(_is_clear(each.confidences[body]) for each in people)
-    if clear > 1:
-        raise CaptureError(
-            image.file,
-            field,
-            f"{clear} people: expected one. Person I is the I-th of each view, counted from 0 in the order of the "
-            "file; or crop the photos, or delete the others from the file",
-        )
-    return _most_confident(people)
-
-
-def _most_confident(people: Sequence[Person]) -> Person | None:
-    return max(people, key=lambda each: each.confidences.sum(), default=None)
-
-
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
     present = confidences[confidences > 0]
     return len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
 
 
 def _usable(
-    values: Float[np.ndarray, "k 3"], offset: float, width: int, height: int, image: DetectedImage, field: str
+    values: Float[np.ndarray, "k 3"], offset: float, width: int, height: int, image: DetectedImage, view: str
 ) -> Person:
-    confidences = values[:, 2]
+    """Raises: CaptureError if confidences are not in [0, 1]."""
     finite = np.logical_and.reduce(np.isfinite(values), axis=1)
-    known = confidences[np.isfinite(confidences)]
+    known = values[np.isfinite(values[:, 2]), 2]
     if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_CONFIDENCE):
         got = f"{known.min():.4g} to {known.max():.4g}"
-        raise CaptureError(image.file, field, f"expected confidences in [0, 1], got {got}")
-    points = np.where(finite[:, None], np.clip(values[:, :2], -LARGEST_PIXEL, LARGEST_PIXEL), 0.0) + offset
-    confidences = np.where(finite, np.clip(confidences, 0.0, 1.0), 0.0)
+        raise CaptureError(image.file, f"view {view}", f"expected confidences in [0, 1], got {got}")
+    values = np.where(finite[:, None], np.clip(values, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
+    points, confidences = values[:, :2] + offset, np.clip(values[:, 2], 0, 1)
     far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
-    return Person(
-        points.astype(np.float32),
-        np.where(far, 0.0, confidences).astype(np.float32),
-        int((~finite).sum()),
-        int(far.sum()),
-    )
+    usable = np.column_stack([points, np.where(far, 0, confidences)])
+    return Person(usable, int((~finite).sum()), int(far.sum()))
 
 
 # Which view -----------------------------------------------------------------------------------------------------------
