@@ -24,8 +24,8 @@ from humangs_jax.avatar.sheets import contact_sheet, side_by_side
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import write_video
 from humangs_jax.core.progress import stage
-from humangs_jax.data.capture import load_capture
-from humangs_jax.data.motion import load_motion
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.motion import Motion, load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
@@ -34,6 +34,7 @@ from humangs_jax.io.reading import write_json
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.viewer.page import write_page
 
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
@@ -58,7 +59,7 @@ def run_demo(
     out = Path(out)
     started, report = time.perf_counter(), {}
 
-    def write(folder: Path):
+    def write(folder: Path) -> None:
         report.update(_write_products(folder, weights, frame_size, refine, settings or Settings()))
         report["total_seconds"] = round(time.perf_counter() - started, 3)
         write_json(folder / "report.json", report, indent=2)
@@ -127,7 +128,9 @@ def _write_products(
     }
 
 
-def _write_files(out, avatar, inputs, truth, ours, frames, motion):
+def _write_files(
+    out: Path, avatar: Avatar, inputs: Capture, truth: Capture, ours: np.ndarray, frames: np.ndarray, motion: Motion
+) -> None:
     contact_sheet(inputs.images, out / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])
     side_by_side(truth.images, ours, out / "novel_views.png")
     write_video(out / "animation.mp4", frames, motion.fps)
@@ -137,7 +140,15 @@ def _write_files(out, avatar, inputs, truth, ours, frames, motion):
     write_page(out / "avatar.html", avatar, motion)
 
 
-def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path, how) -> tuple[Avatar, dict[str, Any]]:
+def _refine(
+    avatar: Avatar,
+    inputs: Capture,
+    truth: Capture,
+    feed_forward: np.ndarray,
+    config: RefineConfig,
+    sheet: Path,
+    how: SplatConfig,
+) -> tuple[Avatar, dict[str, Any]]:
     """The refined avatar, and what the report says of it; draws both beside the truth."""
     run = refine_with_report(avatar, inputs, config, progress=True)
     if run.interrupted:

@@ -10,17 +10,18 @@ and where several are of nearly one size, by the colors of their upper bodies an
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from humangs_jax.apps.start import photo_files
-from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.array_types import Float, Int, UInt
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
@@ -37,8 +38,6 @@ from humangs_jax.io.reading import write_json
 KEYPOINTS_FILE, PEOPLE_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.json", "people.png", "masks"
 RIVAL = 0.35
 """Somebody with this share of the pixels of the largest person may be meant as well as he."""
-LISTED = 3
-"""Names of photos in a line, at most."""
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
 COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
@@ -179,11 +178,10 @@ def same_people(
     return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
 
 
-def _by_colors(photos):
+def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
     """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
-    large = [
-        [each for each in p.people if each and each.area > RIVAL * p.people[0].area][:LARGE_PEOPLE] for p in photos
-    ]
+    found = [[each for each in photo.people if each is not None] for photo in photos]  # the largest first
+    large = [[each for each in people if each.area > RIVAL * people[0].area][:LARGE_PEOPLE] for people in found]
     most = max(range(len(photos)), key=lambda v: len(large[v]))
     if len(large[most]) < 2:
         return photos
@@ -201,7 +199,7 @@ def _by_colors(photos):
     return ordered
 
 
-def _colors(photo, people):
+def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
     """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
     height, width = photo.thumbnail.shape[:2]
     u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
@@ -216,16 +214,16 @@ def _colors(photo, people):
     return found
 
 
-def _areas(photos):
+def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
     """Pixels of each person in all photos together."""
     people = zip(*(photo.people for photo in photos), strict=True)
     return [sum(found.area for found in person if found is not None) for person in people]
 
 
-def _matched(photos, cameras, frames):
+def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[list[Found | None]]:
     """The people of each photo in a common order."""
     times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
-    matches = [match_people([_seen(photos[v], cameras, v) for v in own], MEDIAPIPE_33.mirror) for own in times]
+    matches = [match_people([_seen(photos[v], cameras, int(v)) for v in own], MEDIAPIPE_33.mirror) for own in times]
     rows: list[list[Found | None]] = [[] for _ in photos]
     for own, people in zip(times, in_order_of_time(matches), strict=True):
         for match in people:
@@ -234,9 +232,9 @@ def _matched(photos, cameras, frames):
     return rows
 
 
-def _seen(photo, cameras, view):
+def _seen(photo: PhotoPeople, cameras: Camera, view: int) -> Seen:
     K, transform = (np.asarray(x[view], np.float64) for x in (cameras.K, cameras.cam_from_world))
-    return Seen(K, transform, tuple(each.person.points for each in photo.people))
+    return Seen(K, transform, tuple(each.person.points for each in photo.people if each is not None))
 
 
 def _member(photo: PhotoPeople, match: Match | None, i: int) -> Found | None:
@@ -261,7 +259,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     """
     count = len(photos[0].people)
     if not count:
-        raise ValueError(f"no person in {_few([photo.name for photo in photos])}: expected one who is seen as a whole")
+        raise ValueError(f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a whole")
     if person is not None:
         if not 0 <= person < count:
             raise ArgumentError("person", f"{person}: expected 0 to {count - 1}, as on {sheet}")
@@ -269,13 +267,13 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
         areas = _areas(photos)
         rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
         if rivals:
-            where = _few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
+            where = few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
             raise ValueError(
                 f"{len(rivals) + 1} people in {where}: expected one. Person 0 to {len(rivals)}: numbers on {sheet}"
             )
     if unclear := [photo.name for photo in photos if photo.unclear]:
         raise ValueError(
-            f"{_few(unclear)}: which of the people of {sheet} is meant? Their colors do not tell: cut these photos down to "
+            f"{few(unclear)}: which of the people of {sheet} is meant? Their colors do not tell: cut these photos down to "
             "one person, or leave them out"
         )
     return person or 0
@@ -298,7 +296,9 @@ def person_of(photos: Sequence[PhotoPeople], keypoints: Keypoints, folder: Path)
     return _best(photos, inside, "keypoints", folder)
 
 
-def _best(photos, agreement, given, folder):
+def _best(
+    photos: Sequence[PhotoPeople], agreement: Callable[[int, np.ndarray], float], given: str, folder: Path
+) -> int:
     """The person with the most agreement over all photos."""
     count = len(photos[0].people)
     sums = [
@@ -316,19 +316,21 @@ def absent(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
     return tuple(photo.name for photo in photos if photo.people[person] is None)
 
 
-def cut_off(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
-    """Names of the photos whose border cuts the person: landmarks lie beyond it."""
-    found = [(photo, photo.people[person]) for photo in photos]
-    return tuple(p.name for p, each in found if each is not None and _beyond(each.person.points[:, :2], p.size))
-
-
-def _beyond(points, size):
-    return bool((np.maximum(-points, points - np.asarray(size)) > BEYOND * np.ptp(points, axis=0).max()).any())
-
-
-def repaired(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
-    """Names of the photos in which left and right of the person were exchanged."""
-    return tuple(photo.name for photo in photos if (found := photo.people[person]) is not None and found.mirrored)
+def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
+    """What should be known about the photos of a person, a line each."""
+    told = [f"{name}: the person was not found in it" for name in absent(photos, person)]
+    if any(photo.colors for photo in photos):
+        told.insert(
+            0, f"several people in a photo: number {person} is the same by the colors of upper body and legs alone"
+        )
+    found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
+    for photo, each in found:
+        points = each.person.points[:, :2]
+        beyond = np.maximum(-points, points - np.asarray(photo.size))
+        if (beyond > BEYOND * np.ptp(points, axis=0).max()).any():
+            told.append(f"{photo.name}: a part of the person is outside of the photo")
+    mirrored = "left and right of the person were exchanged, as the other views show: repaired"
+    return told + [f"{photo.name}: {mirrored}" for photo, each in found if each.mirrored]
 
 
 def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path, sheet: Path | None = None) -> int:
@@ -340,10 +342,6 @@ def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path, shee
         sheet.parent.mkdir(parents=True, exist_ok=True)
         write_sheet(sheet, photos)
         raise
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:LISTED]) + (f", ... ({len(names)} photos)" if len(names) > LISTED else "")
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
@@ -361,7 +359,7 @@ def write_found(folder: Path, photos: Sequence[PhotoPeople], person: int) -> Non
             raise ValueError(f"{owners[file]} and {photo.name}: both masks would be {file.as_posix()}: rename one")
         owners[file] = photo.name
 
-    def write(temporary: Path):
+    def write(temporary: Path) -> None:
         _write_people(temporary, photos, person)
         for photo in photos:
             file = mask_file(temporary, photo.name)
@@ -377,7 +375,7 @@ def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, 
     files = [mask_file(Path(), photo.name).as_posix() for photo in photos]
     views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
 
-    def write(temporary: Path):
+    def write(temporary: Path) -> None:
         _write_people(temporary, photos, person)
         if masks:
             (temporary / MASKS).mkdir()
@@ -388,7 +386,7 @@ def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, 
     add_files(folder, write)
 
 
-def _write_people(folder, photos, person):
+def _write_people(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
     write_people(folder / KEYPOINTS_FILE, _images(photos, [person]))
     write_people(folder / PEOPLE_FILE, _images(photos, range(len(photos[0].people))))
     write_sheet(folder / SHEET_FILE, photos, person)
@@ -408,7 +406,7 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
     return mask
 
 
-def _images(photos, numbers):
+def _images(photos: Sequence[PhotoPeople], numbers: Sequence[int]) -> list[ImagePeople]:
     """The photos with some of the people, as the file has them."""
     people = lambda photo: tuple(None if (found := photo.people[i]) is None else found.person for i in numbers)
     return [ImagePeople(photo.name, photo.size, people(photo)) for photo in photos]

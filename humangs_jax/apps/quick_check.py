@@ -82,7 +82,8 @@ class ViewFault:
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
     """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
-    views = _Views.of(capture, VIEWS)
+    some = np.unique(np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int))
+    views = _Views.of(capture.select(some))
     whole, explained = _faults_of_all(views)
     found: dict[str, list[str]] = {}
     for i, name in enumerate(views.names):
@@ -93,51 +94,42 @@ def likely_mistakes(capture: Capture) -> tuple[str, ...]:
 
 def faults(capture: Capture) -> tuple[tuple[str, ...], tuple[ViewFault, ...]]:
     """What is wrong with a capture as a whole, a line each, and with every view."""
-    views = _Views.of(capture, capture.view_count)
+    views = _Views.of(capture)
     return _faults_of_all(views)[0], tuple(_fault(views, i) for i in range(capture.view_count))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Views:
-    """What is compared, in numpy: JAX would compile each of the small operations.
-
-    points: on the skin, by frame. masks: cells of each view, or None. exposures: see `_exposure`.
-    largest: the longest rotation vector of all poses.
-    """
+    """What is compared, in numpy: JAX would compile each of the small operations."""
 
     names: tuple[str, ...]
-    frames: list[int]
-    points: dict[int, np.ndarray]
-    masks: list[np.ndarray] | None
+    points: list[np.ndarray]
+    """On the skin, of each view."""
+    masks: list[Cells] | None
     exposures: list[str | None]
     K: np.ndarray
     cam_from_world: np.ndarray
-    translations: np.ndarray
-    width: int
-    height: int
+    translations: list[np.ndarray]
+    """Of the body, of each view."""
+    size: tuple[int, int]
     largest: float
+    """The longest rotation vector of all poses."""
 
     @classmethod
-    def of(cls, capture: Capture, most: int) -> "_Views":
-        """At most so many views, evenly chosen."""
-        chosen = np.unique(
-            np.linspace(0, capture.view_count - 1, min(capture.view_count, most)).round().astype(int)
-        ).tolist()
-        rotations = np.asarray(capture.poses.rotations, float)
-        translations = np.asarray(capture.poses.translation, float)
-        frames, masks = [int(capture.frames[i]) for i in chosen], capture.masks
+    def of(cls, capture: Capture) -> "_Views":
+        rotations, translations = (np.asarray(x, float) for x in (capture.poses.rotations, capture.poses.translation))
+        frames, masks = [int(frame) for frame in capture.frames], capture.masks
+        points = surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS)
         return cls(
-            names=tuple(capture.names[i] for i in chosen),
-            frames=frames,
-            points=surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS),
-            masks=None if masks is None else [_mask_cells(np.asarray(masks[i])) for i in chosen],
-            exposures=[_exposure(capture.images[i], None if masks is None else masks[i]) for i in chosen],
-            K=np.asarray(capture.cameras.K, float)[chosen],
-            cam_from_world=np.asarray(capture.cameras.cam_from_world, float)[chosen],
-            translations=translations,
-            width=capture.cameras.width,
-            height=capture.cameras.height,
-            largest=float(np.linalg.norm(rotations, axis=-1).max()),
+            capture.names,
+            [points[frame] for frame in frames],
+            None if masks is None else [_mask_cells(mask) for mask in masks],
+            [_exposure(image, None if masks is None else masks[i]) for i, image in enumerate(capture.images)],
+            np.asarray(capture.cameras.K, float),
+            np.asarray(capture.cameras.cam_from_world, float),
+            [translations[frame] for frame in frames],
+            (capture.cameras.width, capture.cameras.height),
+            float(np.linalg.norm(rotations, axis=-1).max()),
         )
 
 
@@ -164,20 +156,19 @@ def _exposure(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"] 
 
 def _exchanged_cameras(views: _Views) -> dict[int, int]:
     """For views that fit the camera of another one: that one. An exchange has to explain all of its views."""
-    if views.masks is None:
-        return {}
-    drawn = lambda i, j: _silhouette(views, i, camera=j)[0]
-    own = [_overlap(drawn(i, i), mask) for i, mask in enumerate(views.masks)]
+    masks = views.masks or []
+    own = [_overlap(_silhouette(views, i)[0], mask) for i, mask in enumerate(masks)]
     off = [i for i, overlap in enumerate(own) if overlap < SURELY_IOU]
     if len(off) < 2:
         return {}
-    overlaps = np.array([[_overlap(drawn(i, j), views.masks[i]) for j in off] for i in off])
     from scipy.optimize import linear_sum_assignment  # takes longer to import than all else here to compute
 
+    overlaps = np.array([[_overlap(_silhouette(views, i, camera=j)[0], masks[i]) for j in off] for i in off])
     chosen = linear_sum_assignment(-overlaps)[1].tolist()
     found = {off[row]: (off[column], overlaps[row, column]) for row, column in enumerate(chosen) if row != column}
     explains = all(overlap > max(SURELY_IOU, own[i] + BETTER) for i, (_, overlap) in found.items())
-    mirrored = [_overlap(drawn(i, i)[:, ::-1], views.masks[i]) for i in found]  # explains views around a person as well
+    # a mirrored photo explains views around a person as well
+    mirrored = [_overlap(_silhouette(views, i)[0][:, ::-1], masks[i]) for i in found]
     if not explains or sum(mirrored) >= sum(overlap for _, overlap in found.values()):
         return {}
     return {i: j for i, (j, _) in found.items()}
@@ -187,14 +178,13 @@ def _fault(views: _Views, i: int) -> ViewFault:
     """What is wrong with one view."""
     body, inside, height = _silhouette(views, i)
     mask = None if views.masks is None else views.masks[i]
-    own = None if mask is None else _overlap(body, mask)
     if mask is not None and not mask.any():
         return ViewFault("the mask is empty", inside)
     if inside < LEAST_INSIDE:
         problem = "most of the body is outside the frame, or behind the camera"
     elif height < LEAST_HEIGHT:
         problem = "the body is tiny, in metres it would not be"
-    elif own is not None and own < LEAST_IOU:
+    elif mask is not None and _overlap(body, mask) < LEAST_IOU:
         problem = "body and mask do not agree"
     else:
         return ViewFault(views.exposures[i], inside)
@@ -208,8 +198,7 @@ def _cause(views: _Views, i: int, body: Cells, mask: Cells | None) -> str | None
     if mask is not None:
         tried = {mistake: _overlap(*undo(body, mask)) for mistake, undo in MISTAKES_OF_IMAGES.items()}
     for mistake, undo in MISTAKES.items():
-        matrix = undo(views.cam_from_world[i], views.translations[views.frames[i]])
-        drawn, inside, height = _silhouette(views, i, matrix=matrix)
+        drawn, inside, height = _silhouette(views, i, undo(views.cam_from_world[i], views.translations[i]))
         if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
             tried[mistake] = 1.0 if mask is None else _overlap(drawn, mask)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
@@ -222,22 +211,21 @@ def _cause(views: _Views, i: int, body: Cells, mask: Cells | None) -> str | None
 
 
 def _silhouette(
-    views: _Views, i: int, camera: int | None = None, matrix: Matrix | None = None
+    views: _Views, i: int, matrix: Matrix | None = None, camera: int | None = None
 ) -> tuple[Cells, float, float]:
     """The cells that the body of view i covers; the share of its points in the image; and its height there, of the image's.
 
-    Arguments: camera: of which view, None: its own. matrix: in place of that camera's.
+    Arguments: matrix: in place of its camera's. camera: of another view.
     """
-    camera = i if camera is None else camera
+    camera, (width, height) = i if camera is None else camera, views.size
     matrix = views.cam_from_world[camera] if matrix is None else matrix
-    points = views.points[views.frames[i]]
-    pixels = points_in_image(points, views.K[camera], matrix, views.width, views.height)
-    shape, cell = _grid(views.width, views.height)
+    pixels = points_in_image(views.points[i], views.K[camera], matrix, width, height)
+    shape, cell = _grid(width, height)
     covered = np.zeros(shape, bool)
     column, row = np.minimum((pixels / cell).astype(int), np.asarray(shape[::-1]) - 1).T
     covered[row, column] = True
-    height = float(np.ptp(pixels[:, 1])) / views.height if len(pixels) else 0.0
-    return _closed(covered), len(pixels) / len(points), height
+    tall = float(np.ptp(pixels[:, 1])) / height if len(pixels) else 0.0
+    return _closed(covered), len(pixels) / len(views.points[i]), tall
 
 
 def _closed(cells: Cells) -> Cells:

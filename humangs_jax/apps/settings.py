@@ -12,7 +12,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -50,6 +50,8 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.runtime import RUNTIMES, Runtime
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.refinement.report import Refinement
+from humangs_jax.rendering.drawing import Rendering
 
 MEASURED = "tradeoff.md"
 KIND = "humangs_jax settings"
@@ -385,7 +387,7 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
     ]
 
 
-def frames_of(avatar: Avatar, settings: Settings, size: int):
+def frames_of(avatar: Avatar, settings: Settings, size: int) -> Iterator[Rendering]:
     """Renderings without end, around the avatar in its T-pose. Nothing is pruned: that is of a motion and its cameras."""
     shot = settings.shot(Shot(size=size))
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), 8, shot)
@@ -395,13 +397,13 @@ def frames_of(avatar: Avatar, settings: Settings, size: int):
     return (jax.block_until_ready(rendering) for rendering in drawn)
 
 
-def _uninterrupted(run):
+def _uninterrupted(run: Refinement) -> Refinement:
     if run.interrupted:
         raise KeyboardInterrupt
     return run
 
 
-def _milliseconds(run):
+def _milliseconds(run: Callable[[], object]) -> float:
     began = time.perf_counter()
     run()
     return 1e3 * (time.perf_counter() - began)

@@ -17,16 +17,10 @@ if TYPE_CHECKING:
 
 def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
     """Say which photos are without the person, and what was repaired."""
-    from humangs_jax.apps.detect import absent, cut_off, repaired
+    from humangs_jax.apps.detect import remarks
 
-    if any(photo.colors for photo in photos):
-        warn(f"several people in a photo: number {person} is the same by the colors of upper body and legs alone")
-    for name in absent(photos, person):
-        warn(f"{name}: the person was not found in it")
-    for name in cut_off(photos, person):
-        warn(f"{name}: a part of the person is outside of the photo")
-    for name in repaired(photos, person):
-        warn(f"{name}: left and right of the person were exchanged, as the other views show: repaired")
+    for line in remarks(photos, person):
+        warn(line)
 
 
 def found_here(capture: Path, person: int | None) -> Path:

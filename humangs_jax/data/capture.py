@@ -234,7 +234,14 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
     replace_folder(path, lambda folder: _write_folder(folder, capture, path), mark="capture.json")
 
 
-def _assemble(photos, body, betas, rotations, translations, body_file):
+def _assemble(
+    photos: Photos,
+    body: BodyModel,
+    betas: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    body_file: str | Path,
+) -> Capture:
     return Capture(
         **vars(photos),
         body=body,
@@ -244,7 +251,7 @@ def _assemble(photos, body, betas, rotations, translations, body_file):
     )
 
 
-def _load_model(file, name, folder=None):
+def _load_model(file: object, name: str, folder: Path | None = None) -> BodyModel:
     model_file = Path(name) if folder is None else folder / name
     if name != DEFAULT_BODY and not model_file.is_file():
         raise CaptureError(file, "body", f"no model file at {model_file}: expected {DEFAULT_BODY!r} or the path of one")
@@ -284,7 +291,7 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
-def _check_before_writing(capture):
+def _check_before_writing(capture: Capture) -> None:
     """Everything that reading would check, of a `Capture` made by hand."""
     v, (height, width) = len(capture.images), capture.images.shape[1:3]
     cameras, poses = capture.cameras, capture.poses
@@ -310,7 +317,7 @@ def _check_before_writing(capture):
     )
 
 
-def _write_folder(folder, capture, target):
+def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
     (folder / "images").mkdir(parents=True)
     if capture.masks is not None:
         (folder / "masks").mkdir()

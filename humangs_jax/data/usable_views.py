@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 
@@ -129,7 +129,9 @@ def points_in_image(
     return pixels[((pixels >= 0) & (pixels < (width, height))).all(axis=-1)]
 
 
-def _sampling(vertices, faces, count):
+def _sampling(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
+) -> tuple[Int[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
     """Corners (p, 3) and weights (p, 3) of points that are spread evenly over a mesh."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
@@ -140,7 +142,9 @@ def _sampling(vertices, faces, count):
     return faces[np.minimum(chosen, len(faces) - 1)], np.stack([1 - u - v, u, v], axis=-1)
 
 
-def _joint_moves(joints, parents, rotations) -> Float[np.ndarray, "j 3 4"]:
+def _joint_moves(
+    joints: Float[np.ndarray, "j 3"], parents: Sequence[int], rotations: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "j 3 4"]:
     """Rigid transforms from the rest pose to the pose."""
     angles = np.linalg.norm(rotations, axis=-1)
     x, y, z = (rotations / np.maximum(angles, 1e-12)[:, None]).T

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +95,7 @@ def fits(body: BodyModel, config: HumanGSConfig) -> bool:
     return body.made_for == _wanted(config) or not any(_wanted(config))
 
 
-def _wanted(config):
+def _wanted(config: HumanGSConfig) -> tuple[Any, ...]:
     trained, asked = config.conventions, config.runtime
     vertices, edges = (trained.body_vertices, trained.longest_edge), (asked.body_vertices, asked.longest_edge)
     return *vertices, *edges, config.architecture.surface_map
@@ -143,7 +144,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
     """
     rest = shape_body(body, views.betas)
 
-    def pose_view(rotations, translation):
+    def pose_view(rotations: Float[Array, "j 3"], translation: Float[Array, "3"]) -> Float[Array, "n 3"]:
         return pose_body(body, rest, BodyPose(rotations, translation)).vertices
 
     posed = jax.vmap(pose_view)(views.rotations, views.translations)
@@ -214,7 +215,9 @@ def cropped(capture: Capture, size: int) -> Capture:
     return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=cut(capture.masks, 0.0), cameras=cameras)
 
 
-def _window(image, left, top, side, fill):
+def _window(
+    image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float
+) -> Float[np.ndarray, "side side *c"]:
     """A square of an image, filled up where it reaches beyond."""
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)

@@ -174,4 +174,5 @@ def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path
     monkeypatch.setattr(detect, "detect_photos", lambda names, photos: shown)
     ordered = detect.found_in_photos(tmp_path / "c")
     assert [p.people[0].area for p in ordered] == [50.0, 50.0, 50.0, 50.0]
-    assert detect.repaired(ordered, 0) == () and detect.repaired(ordered, 1) == (f"{capture.names[2]}.png",)
+    repaired = lambda person: [line for line in detect.remarks(ordered, person) if line.endswith("repaired")]
+    assert repaired(0) == [] and [line.split(":")[0] for line in repaired(1)] == [f"{capture.names[2]}.png"]

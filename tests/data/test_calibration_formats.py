@@ -17,9 +17,22 @@ PIXELS = 1e-3
 NAMES = ("a", "b", "c", "d")
 
 
+FILES = tuple(f"{name}.png" for name in NAMES)
+
+
+def change(file, edit):
+    values = json.loads(file.read_text())
+    edit(values)
+    file.write_text(json.dumps(values))
+
+
+def views_of(out):
+    return json.loads((out / "capture.json").read_text())["views"]
+
+
 def error_of(out, K, poses):
     """Largest distance in pixels between points seen by the imported cameras and by the true ones."""
-    views = json.loads((out / "capture.json").read_text())["views"]
+    views = views_of(out)
     p = written.points()
     got = [written.project(np.asarray(view["K"]), np.asarray(view["cam_from_world"]), p) for view in views]
     true = [written.project(K[i % len(K)], poses[i % len(poses)], p) for i in range(len(views))]
@@ -29,7 +42,7 @@ def error_of(out, K, poses):
 def write(kind, folder, K, poses):
     """A calibration in that format of those source-world poses, and photos: (source, images)."""
     images = folder / "photos"
-    files = [f"{name}.png" for name in NAMES]
+    files = FILES
     source = folder / kind
     if kind == "colmap":
         files = ["front view.png", "left/1.png", "right/1.png", "back.png"]
@@ -87,7 +100,7 @@ def test_any_axis_can_be_up(tmp_path, up):
     source, images = write("full", tmp_path, K, written.in_source(poses, turn=turn))
     report = import_cameras(source, images, tmp_path / "out", up=up)
     assert report.warnings == ()
-    views = json.loads((tmp_path / "out" / "capture.json").read_text())["views"]
+    views = views_of(tmp_path / "out")
     got, true = (
         np.stack([p[:3, :3] for p in which]) for which in (np.asarray([v["cam_from_world"] for v in views]), poses)
     )
@@ -102,10 +115,10 @@ def test_any_axis_can_be_up(tmp_path, up):
 def test_easymocap_with_three_decimals(tmp_path):
     K, poses = written.scene()
     written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=3)
-    written.write_photos(tmp_path / "photos", [f"{name}.png" for name in NAMES])
+    written.write_photos(tmp_path / "photos", FILES)
     import_cameras(tmp_path / "cams" / "intri.yml", tmp_path / "photos", tmp_path / "out", up="+y")
     assert error_of(tmp_path / "out", K, poses) < 0.1  # 5e-4 of rounding times a focal length of 70 px
-    for view in json.loads((tmp_path / "out" / "capture.json").read_text())["views"]:
+    for view in views_of(tmp_path / "out"):
         r = np.asarray(view["cam_from_world"])[:3, :3]
         np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-12)  # rounded no longer
 
@@ -125,14 +138,12 @@ def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
     np.testing.assert_allclose(cameras["1"].cam_from_world[:3, :3], poses[0, :3, :3], atol=1e-6)
 
 
-@pytest.mark.parametrize("key", ["R", "Rot"])
-def test_rotation_vector_and_matrix_agree(tmp_path, key):
+def test_rotation_vectors_are_read_where_there_is_no_matrix(tmp_path):
     K, poses = written.scene()
     written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=9)
     extri = tmp_path / "cams" / "extri.yml"
-    if key == "R":
-        extri.write_text(extri.read_text().replace("Rot_", "Unused_"))
-    written.write_photos(tmp_path / "photos", [f"{name}.png" for name in NAMES])
+    extri.write_text(extri.read_text().replace("Rot_", "Unused_"))
+    written.write_photos(tmp_path / "photos", FILES)
     import_cameras(tmp_path / "cams", tmp_path / "photos", tmp_path / "out", up="+y")
     assert error_of(tmp_path / "out", K, poses) < PIXELS
 
@@ -145,7 +156,7 @@ def test_colmap_points_are_reprojected(tmp_path):
     for k, pose in zip(K, poses, strict=True):
         plane = (written.project(k, pose, p) - k[:2, 2]) / k[0, 0]
         seen.append(plane * (1 + k1 * (plane**2).sum(-1, keepdims=True)) * k[0, 0] + k[:2, 2])
-    names = [f"{name}.png" for name in NAMES]
+    names = FILES
     written.write_colmap(tmp_path / "model", K, poses, names, "SIMPLE_RADIAL", [k1], seen, p)
     written.write_photos(tmp_path / "photos", names)
     report = import_cameras(tmp_path / "model", tmp_path / "photos", tmp_path / "out", up="+y")
@@ -242,3 +253,146 @@ same_level:
 def test_faults_of_file_storage_name_the_line(text, problem):
     with pytest.raises(CaptureError, match=problem):
         parse_file_storage(text, Path("file"))
+
+
+# Faults, and moments of videos ---------------------------------------------------------------------------------------------
+
+
+def colmap(tmp_path, cameras=None, images=None):
+    folder = tmp_path / "model"
+    written.write_colmap(folder, *written.scene(), FILES)
+    for name, edit in (("cameras.txt", cameras), ("images.txt", images)):
+        if edit is not None:
+            (folder / name).write_text(edit((folder / name).read_text()))
+    written.write_photos(tmp_path / "photos", FILES)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "problem"),
+    [
+        (
+            lambda t: t.replace("PINHOLE", "OPENCV_FISHEYE"),
+            None,
+            "line 2: camera model OPENCV_FISHEYE: expected one of",
+        ),
+        (
+            lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"),
+            None,
+            "line 2: SIMPLE_PINHOLE: expected WIDTH HEIGHT f cx cy",
+        ),
+        (lambda t: t.replace("64 48", "64 x"), None, "line 2: could not convert"),
+        (lambda t: t[: t.index("\n2 ")], None, "line 5: camera 2 is not in cameras.txt"),
+        (None, lambda t: "# nothing\n", "images.txt: no image is registered"),
+        (
+            None,
+            lambda t: "\n".join(line for line in t.split("\n") if line),
+            "line 4: expected X Y POINT3D_ID of each point",
+        ),
+        (None, lambda t: t.replace("a.png", ""), "line 3: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"),
+        (None, lambda t: t.replace("b.png", "z.png"), r"images\.txt: z\.png: no such photo \(PNG or JPEG\)"),
+        (None, lambda t: t.replace("b.png", "sub/a.png"), r"a\.png is the photo of a\.png already"),
+        (None, lambda t: "1 0 0 0 0 0 0 0 1 a.png\n\n", "line 1: expected a quaternion"),
+    ],
+)
+def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, problem):
+    with pytest.raises(CaptureError, match=problem):
+        import_cameras(colmap(tmp_path, cameras, images), tmp_path / "photos", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("edit", "problem"),
+    [
+        (lambda v: v.update(frames=[]), "frames: expected at least one"),
+        (lambda v: v.update(frames={}), "frames: expected a list"),
+        (lambda v: v["frames"][1].pop("transform_matrix"), r"frames\[1\]\.transform_matrix: missing"),
+        (lambda v: v["frames"][1].pop("file_path"), r"frames\[1\]\.file_path: missing"),
+        (lambda v: v["frames"][1].update(file_path="z"), r"transforms\.json: z: no such photo"),
+        (
+            lambda v: [f.pop("fl_x") and f.pop("fl_y") for f in v["frames"]],
+            r"frames\[0\]\.fl_x: missing: expected fl_x or",
+        ),
+        (
+            lambda v: v["frames"][1].update(transform_matrix=[[0.0] * 4] * 4),
+            r"frames\[1\]\.transform_matrix: .*singular",
+        ),
+        (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "camera_model: 'OPENCV_FISHEYE': expected"),
+        (lambda v: v.update(is_fisheye=True), "is_fisheye: fisheye lenses"),
+        (lambda v: v.update(k4=0.1), "k4: expected 0"),
+        (lambda v: v.pop("w"), r"frames\[0\]\.w: missing"),
+        (lambda v: v.pop("w") and v.pop("h") and v["frames"][0].update(file_path="z"), "z: no such photo"),
+    ],
+)
+def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
+    written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES)
+    change(tmp_path / "transforms.json", edit)
+    written.write_photos(tmp_path / "photos", FILES)
+    with pytest.raises(CaptureError, match=problem):
+        import_cameras(tmp_path / "transforms.json", tmp_path / "photos", tmp_path / "out")
+
+
+def at_moments(tmp_path, keys, poses=None):
+    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has; default: three, twice."""
+    names = [f"{i}.png" for i in range(6)]
+    K, all_poses = written.scene(3 if poses is None else 6)
+    which = [0, 1, 2, 0, 1, 2] if poses is None else poses
+    written.write_transforms(tmp_path / "transforms.json", K[which], all_poses[which], names)
+    written.write_photos(tmp_path / "images", names)
+    change(tmp_path / "transforms.json", lambda v: [f.update(own) for f, own in zip(v["frames"], keys, strict=True)])
+    return import_cameras(tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out", up="+y")
+
+
+ALL = range(6)
+
+
+FLOAT_TIMES = [0.1 + 0.2, 0.3, 0.3, 1 / 3, 0.33333333, 0.3333333333]
+
+
+MOMENTS = {
+    "VHAP": ([{"timestep_index": i // 3, "camera_index": i % 3} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
+    "sparse steps, mixed up": ([{"timestep_index": (9, 3)[i // 3]} for i in ALL], None, 3, [1, 1, 1, 0, 0, 0]),
+    "seconds": ([{"time": t, "camera_index": i % 3} for i, t in enumerate(FLOAT_TIMES)], None, 3, [0, 0, 0, 1, 1, 1]),
+    "names": ([{"timestep_id": f"frame_{i // 3}", "camera_id": f"{i % 3}"} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
+    "D-NeRF: one camera that moves": ([{"time": i / 5} for i in ALL], list(ALL), 6, list(ALL)),
+    "one moment": ([{"time": 0.0, "camera_index": i} for i in ALL], list(ALL), 6, [0] * 6),
+    "one camera, by index": ([{"camera_index": 0}] * 6, list(ALL), 1, list(ALL)),
+    "one camera, by pose": ([{}] * 6, [2] * 6, 1, list(ALL)),
+    "a scene that stands still": ([{}] * 6, list(ALL), 6, [0] * 6),
+}
+
+
+@pytest.mark.parametrize("kind", MOMENTS)
+def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
+    keys, poses, cameras, frames = MOMENTS[kind]
+    report = at_moments(tmp_path, keys, poses)
+    assert {view["image"]: view["frame"] for view in views_of(tmp_path / "out")} == {
+        f"images/{i}.png": frame for i, frame in enumerate(frames)
+    }
+    assert [view["frame"] for view in views_of(tmp_path / "out")] == sorted(frames)
+    assert (report.cameras, report.frames) == (cameras, max(frames) + 1)
+    assert any("no two photos show the same moment" in w for w in report.warnings) == (kind.startswith("D-NeRF"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ([{"camera_index": i % 3} for i in ALL], r"frames\[0\] and frames\[3\] have the camera_index 0, so they show"),
+        (
+            [{"camera_id": f"c{i % 2}"} for i in ALL],
+            r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest",
+        ),
+        ([{}] * 6, r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments"),
+        ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing, but other frames have it"),
+        ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number or a name, got None"),
+        ([{"time": float("nan")} for i in ALL], r"frames\[0\]\.time: expected finite numbers"),
+        ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),
+        (
+            [{"timestep_index": 0, "camera_index": i % 3} for i in ALL],
+            r"frames\[3\]: the camera_index and timestep_index of frames\[0\]: expected one photo of a camera",
+        ),
+    ],
+)
+def test_moments_that_cannot_be_told_apart_are_refused(tmp_path, keys, problem):
+    with pytest.raises(CaptureError, match=problem):
+        at_moments(tmp_path, keys)
+    assert not (tmp_path / "out").exists()

@@ -10,10 +10,7 @@ from PIL import Image
 from humangs_jax.data.calibration.calibration import (
     CONVENTIONS,
     WORLD_FROM_CAM_OPENGL,
-    _squared_reach,
-    distort,
     undistort,
-    undistort_person,
 )
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
@@ -148,54 +145,6 @@ def distort_rig(file, coefficients):
             camera["distCoeff"] = list(coefficients)
 
     change(file, edit)
-
-
-def test_dots_land_where_the_pinhole_says():
-    K = np.asarray([[110.0, 0, 63.5], [0, 108, 50], [0, 0, 1]])
-    coefficients = np.asarray([-0.25, 0.08, 0.004, -0.003, 0.01])
-    dots = np.stack(np.meshgrid(np.arange(-4, 5) * 0.12, np.arange(-3, 4) * 0.12), axis=-1).reshape(-1, 2)
-    pinhole, lens = (plane * np.diag(K)[:2] + K[:2, 2] for plane in (dots, distort(dots, coefficients)))
-    assert np.linalg.norm(pinhole - lens, axis=-1).max() > 4  # the lens matters
-    columns, rows = np.meshgrid(np.arange(128) + 0.5, np.arange(100) + 0.5)
-    spots = lambda where: np.exp(-((columns - where[0]) ** 2 + (rows - where[1]) ** 2) / (2 * 1.5**2))
-    photo = sum(spots(where) for where in lens).astype(np.float32)
-    straight = undistort(photo, K, coefficients, fill=0.0)
-    for where in pinhole:
-        near = straight * (np.hypot(columns - where[0], rows - where[1]) < 5)
-        centroid = np.asarray([(near * columns).sum(), (near * rows).sum()]) / near.sum()
-        np.testing.assert_allclose(centroid, where, atol=0.06)  # of bilinear lookups; the dots move by up to 4.9 px
-
-
-@pytest.mark.parametrize("focal, coefficients", [(400, [-0.1, 0.03, 1e-3, -1e-3, 0]), (60, [-0.3, 0, 0, 0, 0])])
-def test_a_person_is_undistorted_as_the_whole_photo_is(focal, coefficients):
-    """Also where the lens folds, and with nobody in the photo."""
-    K, coefficients = np.asarray([[focal, 0, 66.0], [0, focal, 50], [0, 0, 1]]), np.asarray(coefficients)
-    random = np.random.default_rng(0)
-    for rows, columns in ((slice(30, 70), slice(50, 75)), (slice(0, 20), slice(100, 130)), (slice(0), slice(0))):
-        mask = np.zeros((100, 130), np.float32)
-        mask[rows, columns] = 1
-        image = np.where(mask[..., None] > 0, random.random((100, 130, 3), np.float32), np.float32(1))
-        straight, person = undistort_person(image, mask, K, coefficients)
-        np.testing.assert_array_equal(person, undistort(mask, K, coefficients, fill=0.0))
-        np.testing.assert_allclose(straight, undistort(image, K, coefficients, fill=1.0), atol=1e-6)
-
-
-def test_distortion_is_opencvs():
-    # by hand: r^2 = 0.05, radial = 1 + 0.1 * 0.05 - 0.2 * 0.0025 + 0.5 * 0.000125
-    radial = 1 + 0.005 - 0.0005 + 0.0000625
-    x = 0.1 * radial + 2 * 0.01 * 0.02 + 0.03 * (0.05 + 0.02)
-    y = 0.2 * radial + 0.01 * (0.05 + 0.08) + 2 * 0.03 * 0.02
-    got = distort(np.asarray([0.1, 0.2]), np.asarray([0.1, -0.2, 0.01, 0.03, 0.5]))
-    np.testing.assert_allclose(got, [x, y], rtol=1e-12)
-
-
-def test_a_folded_lens_shows_nothing_twice():
-    K = np.asarray([[30.0, 0, 40], [0, 30, 40], [0, 0, 1]])
-    photo = np.zeros((80, 80), np.float32)
-    straight = undistort(photo, K, np.asarray([-0.3, 0, 0, 0, 0.0]), fill=1.0)
-    r = np.hypot(*(np.mgrid[:80, :80] + 0.5 - 40)) / 30
-    np.testing.assert_array_equal(straight[r**2 >= 1 / 0.9], 1)
-    np.testing.assert_array_equal(straight[r**2 < 1 / 0.9 - 0.05], 0)
 
 
 def test_photos_and_masks_are_undistorted(rig, tmp_path):
@@ -381,79 +330,6 @@ def test_wrong_options_are_named(rig, options, problem):
         import_rig(rig, **options)
 
 
-def colmap(tmp_path, cameras=None, images=None):
-    folder = tmp_path / "model"
-    written.write_colmap(folder, *written.scene(), FILES)
-    for name, edit in (("cameras.txt", cameras), ("images.txt", images)):
-        if edit is not None:
-            (folder / name).write_text(edit((folder / name).read_text()))
-    written.write_photos(tmp_path / "photos", FILES)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("cameras", "images", "problem"),
-    [
-        (
-            lambda t: t.replace("PINHOLE", "OPENCV_FISHEYE"),
-            None,
-            "line 2: camera model OPENCV_FISHEYE: expected one of",
-        ),
-        (
-            lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"),
-            None,
-            "line 2: SIMPLE_PINHOLE: expected WIDTH HEIGHT f cx cy",
-        ),
-        (lambda t: t.replace("64 48", "64 x"), None, "line 2: could not convert"),
-        (lambda t: t[: t.index("\n2 ")], None, "line 5: camera 2 is not in cameras.txt"),
-        (None, lambda t: "# nothing\n", "images.txt: no image is registered"),
-        (
-            None,
-            lambda t: "\n".join(line for line in t.split("\n") if line),
-            "line 4: expected X Y POINT3D_ID of each point",
-        ),
-        (None, lambda t: t.replace("a.png", ""), "line 3: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"),
-        (None, lambda t: t.replace("b.png", "z.png"), r"images\.txt: z\.png: no such photo \(PNG or JPEG\)"),
-        (None, lambda t: t.replace("b.png", "sub/a.png"), r"a\.png is the photo of a\.png already"),
-        (None, lambda t: "1 0 0 0 0 0 0 0 1 a.png\n\n", "line 1: expected a quaternion"),
-    ],
-)
-def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, problem):
-    with pytest.raises(CaptureError, match=problem):
-        import_cameras(colmap(tmp_path, cameras, images), tmp_path / "photos", tmp_path / "out")
-
-
-@pytest.mark.parametrize(
-    ("edit", "problem"),
-    [
-        (lambda v: v.update(frames=[]), "frames: expected at least one"),
-        (lambda v: v.update(frames={}), "frames: expected a list"),
-        (lambda v: v["frames"][1].pop("transform_matrix"), r"frames\[1\]\.transform_matrix: missing"),
-        (lambda v: v["frames"][1].pop("file_path"), r"frames\[1\]\.file_path: missing"),
-        (lambda v: v["frames"][1].update(file_path="z"), r"transforms\.json: z: no such photo"),
-        (
-            lambda v: [f.pop("fl_x") and f.pop("fl_y") for f in v["frames"]],
-            r"frames\[0\]\.fl_x: missing: expected fl_x or",
-        ),
-        (
-            lambda v: v["frames"][1].update(transform_matrix=[[0.0] * 4] * 4),
-            r"frames\[1\]\.transform_matrix: .*singular",
-        ),
-        (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "camera_model: 'OPENCV_FISHEYE': expected"),
-        (lambda v: v.update(is_fisheye=True), "is_fisheye: fisheye lenses"),
-        (lambda v: v.update(k4=0.1), "k4: expected 0"),
-        (lambda v: v.pop("w"), r"frames\[0\]\.w: missing"),
-        (lambda v: v.pop("w") and v.pop("h") and v["frames"][0].update(file_path="z"), "z: no such photo"),
-    ],
-)
-def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
-    written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES)
-    change(tmp_path / "transforms.json", edit)
-    written.write_photos(tmp_path / "photos", FILES)
-    with pytest.raises(CaptureError, match=problem):
-        import_cameras(tmp_path / "transforms.json", tmp_path / "photos", tmp_path / "out")
-
-
 def test_sources_that_are_none_are_named(rig, tmp_path):
     empty, binary, half = (tmp_path / name for name in ("empty", "binary", "half"))
     for folder in (empty, binary, half):
@@ -482,23 +358,6 @@ def test_a_bare_photo_of_16_bits_stays_what_it_is(rig):
     Image.fromarray(deep).save(rig[1] / "a.png")
     import_rig(rig)
     np.testing.assert_allclose(read_image(rig[2] / "images" / "a.png")[0][..., 0], deep / 65535, rtol=1e-6)
-
-
-@pytest.mark.parametrize("folds", [(2,), (3, 2), (5, 2, 3), (-1, 4), (-1, -2, -3), ()])
-def test_a_lens_folds_at_the_first_root_of_its_slope(folds):
-    """The slope d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) as a product of (1 - r^2 / fold)."""
-    slope = np.polynomial.Polynomial([1.0])
-    for fold in folds:
-        slope *= np.polynomial.Polynomial([1, -1 / fold])
-    k1, k2, k3 = np.pad(slope.coef, (0, 4 - len(slope.coef)))[1:] / [3, 5, 7]
-    expected = min((fold for fold in folds if fold > 0), default=np.inf)
-    assert _squared_reach(np.array([k1, k2, 0, 0, k3])) == pytest.approx(expected, rel=1e-9)
-
-
-def test_coefficients_of_a_lens_may_be_tiny_or_huge():
-    for k3 in (1e-310, -1e-310):
-        assert _squared_reach([-0.3, 0, 0, 0, k3]) == pytest.approx(1 / 0.9, rel=1e-9)
-    assert 0 < _squared_reach(np.full(5, -1e308)) < 1e-30
 
 
 # Masks -------------------------------------------------------------------------------------------------------------
@@ -611,66 +470,3 @@ def test_masks_named_for_some_or_outside_are_refused(tmp_path):
 
 
 # Moments -----------------------------------------------------------------------------------------------------------
-
-
-def at_moments(tmp_path, keys, poses=None):
-    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has; default: three, twice."""
-    names = [f"{i}.png" for i in range(6)]
-    K, all_poses = written.scene(3 if poses is None else 6)
-    which = [0, 1, 2, 0, 1, 2] if poses is None else poses
-    written.write_transforms(tmp_path / "transforms.json", K[which], all_poses[which], names)
-    written.write_photos(tmp_path / "images", names)
-    change(tmp_path / "transforms.json", lambda v: [f.update(own) for f, own in zip(v["frames"], keys, strict=True)])
-    return import_cameras(tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out", up="+y")
-
-
-ALL = range(6)
-FLOAT_TIMES = [0.1 + 0.2, 0.3, 0.3, 1 / 3, 0.33333333, 0.3333333333]
-MOMENTS = {
-    "VHAP": ([{"timestep_index": i // 3, "camera_index": i % 3} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
-    "sparse steps, mixed up": ([{"timestep_index": (9, 3)[i // 3]} for i in ALL], None, 3, [1, 1, 1, 0, 0, 0]),
-    "seconds": ([{"time": t, "camera_index": i % 3} for i, t in enumerate(FLOAT_TIMES)], None, 3, [0, 0, 0, 1, 1, 1]),
-    "names": ([{"timestep_id": f"frame_{i // 3}", "camera_id": f"{i % 3}"} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
-    "D-NeRF: one camera that moves": ([{"time": i / 5} for i in ALL], list(ALL), 6, list(ALL)),
-    "one moment": ([{"time": 0.0, "camera_index": i} for i in ALL], list(ALL), 6, [0] * 6),
-    "one camera, by index": ([{"camera_index": 0}] * 6, list(ALL), 1, list(ALL)),
-    "one camera, by pose": ([{}] * 6, [2] * 6, 1, list(ALL)),
-    "a scene that stands still": ([{}] * 6, list(ALL), 6, [0] * 6),
-}
-
-
-@pytest.mark.parametrize("kind", MOMENTS)
-def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
-    keys, poses, cameras, frames = MOMENTS[kind]
-    report = at_moments(tmp_path, keys, poses)
-    assert {view["image"]: view["frame"] for view in views_of(tmp_path / "out")} == {
-        f"images/{i}.png": frame for i, frame in enumerate(frames)
-    }
-    assert [view["frame"] for view in views_of(tmp_path / "out")] == sorted(frames)
-    assert (report.cameras, report.frames) == (cameras, max(frames) + 1)
-    assert any("no two photos show the same moment" in w for w in report.warnings) == (kind.startswith("D-NeRF"))
-
-
-@pytest.mark.parametrize(
-    ("keys", "problem"),
-    [
-        ([{"camera_index": i % 3} for i in ALL], r"frames\[0\] and frames\[3\] have the camera_index 0, so they show"),
-        (
-            [{"camera_id": f"c{i % 2}"} for i in ALL],
-            r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest",
-        ),
-        ([{}] * 6, r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments"),
-        ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing, but other frames have it"),
-        ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number or a name, got None"),
-        ([{"time": float("nan")} for i in ALL], r"frames\[0\]\.time: expected finite numbers"),
-        ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),
-        (
-            [{"timestep_index": 0, "camera_index": i % 3} for i in ALL],
-            r"frames\[3\]: the camera_index and timestep_index of frames\[0\]: expected one photo of a camera",
-        ),
-    ],
-)
-def test_moments_that_cannot_be_told_apart_are_refused(tmp_path, keys, problem):
-    with pytest.raises(CaptureError, match=problem):
-        at_moments(tmp_path, keys)
-    assert not (tmp_path / "out").exists()

@@ -1,8 +1,7 @@
+import dataclasses
 import json
 import re
 import shutil
-import struct
-import zlib
 from pathlib import Path
 
 import jax
@@ -15,7 +14,7 @@ from humangs_jax.data import photos as photos_module
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.photos import check_photos, names_from_paths
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.io.images import read_image, write_png
+from humangs_jax.io.images import write_png
 
 HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
 HALF_LEVEL = 0.5 / 255 + 1e-6
@@ -87,13 +86,6 @@ def test_round_trip(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing temporary stays
 
 
-def test_round_trip_without_masks(tmp_path):
-    capture = capture_from_arrays(**{**arrays(), "masks": None})
-    save_capture(tmp_path / "me", capture)
-    assert load(tmp_path / "me").masks is None
-    np.testing.assert_allclose(capture.images, arrays()["images"], atol=1e-7)
-
-
 TOO_MANY = "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is 1,000,000,000"
 
 
@@ -118,6 +110,7 @@ def test_masks_put_photos_on_white_once(tmp_path):
     np.testing.assert_allclose(capture_from_arrays(**a).images, on_white, atol=1e-6)
     np.testing.assert_allclose(capture_from_arrays(**a, background="white").images, a["images"], atol=1e-7)
     save_capture(tmp_path / "me", capture_from_arrays(**{**a, "masks": None}))
+    assert load(tmp_path / "me").masks is None
     mask = a["masks"][0]
     write_png(tmp_path / "me" / "mask.png", mask)
     description = json.loads((tmp_path / "me" / "capture.json").read_text())
@@ -156,41 +149,6 @@ def test_alpha_is_the_mask_and_goes_onto_white(folder):
     alpha = pixels[..., 3:] / 255
     np.testing.assert_allclose(capture.masks[0], alpha[..., 0], atol=1e-6)
     np.testing.assert_allclose(capture.images[0], pixels[..., :3] / 255 * alpha + 1 - alpha, atol=1e-6)
-
-
-def deep_png(pixels, color_type):
-    def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, color_type, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
-
-
-@pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
-def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, color_type):
-    pixels = np.random.default_rng(1).integers(0, 65536, (7, 9, channels), np.uint16)
-    (tmp_path / "deep.png").write_bytes(deep_png(pixels, color_type))
-    colors, alpha = read_image(tmp_path / "deep.png")
-    expected = pixels.astype(np.float32) / np.float32(65535)
-    np.testing.assert_array_equal(colors, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
-    if channels in (2, 4):
-        np.testing.assert_array_equal(alpha, expected[..., -1])
-    else:
-        assert alpha is None
-
-
-@pytest.mark.parametrize("mode", ["L", "1", "P", "RGB", "CMYK", "LA", "RGBA"])
-def test_every_common_image_mode_is_read(tmp_path, mode):
-    from PIL import Image
-
-    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(mode)
-    suffix = "jpg" if mode == "CMYK" else "png"
-    image.save(tmp_path / f"x.{suffix}")
-    colors, alpha = read_image(tmp_path / f"x.{suffix}")
-    assert colors.shape == (8, 9, 3) and (alpha is not None) == mode.endswith("A")
-    if mode != "CMYK":  # JPEG is lossy
-        np.testing.assert_allclose(colors, np.asarray(image.convert("RGB")) / 255, atol=1e-6)
 
 
 def test_frame_may_be_left_out_for_a_single_pose(folder):
@@ -316,7 +274,6 @@ BAD = {
     "mask for some": (drop(1, "mask"), "capture.json: views[1].mask", "all or none"),
     "K shape": (view(1, K=[[1, 0], [0, 1]]), "capture.json: views[1].K", "(3, 3)"),
     "K ragged": (view(1, K=[[1, 0, 0], [0, 1]]), "capture.json: views[1].K", "3 x 3 numbers"),
-    "K words": (view(1, K="wide"), "capture.json: views[1].K", "3 x 3 numbers"),
     "K null": (view(1, K=None), "capture.json: views[1].K", "3 x 3 numbers"),
     "K not finite": (view(1, K=NOT_FINITE), "capture.json: views[1].K", "finite"),
     "K transposed": (view(1, K=[[9, 0, 0], [0, 9, 0], [5, 5, 1]]), "capture.json: views[1]: K", "fx"),
@@ -385,7 +342,6 @@ BAD_ARRAYS = {
     "mask range": (dict(masks=np.full((VIEWS, HEIGHT, WIDTH), 255)), "masks: expected values"),
     "K": (dict(K=np.zeros((VIEWS, 3, 3))), "view 0: K"),
     "K count": (dict(K=np.zeros((VIEWS + 1, 3, 3))), "K: expected shape"),
-    "K ragged": (dict(K=[[1, 2], [3]]), "K: expected numbers"),
     "cameras": (dict(cam_from_world=np.zeros((VIEWS, 3, 4))), "cam_from_world: expected shape"),
     "frames count": (dict(frames=[0]), "frames: expected shape"),
     "frames range": (dict(frames=[0, 1, 2]), "frames[2]: expected 0 to 1"),
@@ -394,8 +350,6 @@ BAD_ARRAYS = {
     "names": (dict(names=["a", "a", "b"]), "names: expected 3 different names"),
     "name with slash": (dict(names=["a", "../b", "c"]), "names: expected letters"),
     "background": (dict(background="black"), "background: expected one of"),
-    "betas": (dict(betas=np.ones(9)), "betas: 9 coefficients, but body 'tiny' has 3"),
-    "rotations": (dict(rotations=np.full((FRAMES, JOINTS, 3), np.inf)), "rotations: expected finite"),
 }
 
 
@@ -414,8 +368,6 @@ OWN_NAMES = ("sex", "age", "height")
 
 
 def named(names):
-    import dataclasses
-
     return dataclasses.replace(tiny_body(), shape_names=names)
 
 
@@ -466,8 +418,6 @@ def test_betas_of_another_kind_are_refused(kind):
 
 
 def spoiled(**changes):
-    import dataclasses
-
     return dataclasses.replace(capture_from_arrays(**arrays()), **changes)
 
 

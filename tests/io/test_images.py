@@ -1,6 +1,8 @@
 """Photos at other sizes, masks as segmentation tools write them, EXIF and HEIC. (Reading and writing photos: tests/data.)"""
 
+import struct
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -259,3 +261,36 @@ def test_pixels_are_turned_as_pillow_turns_them(flag, tmp_path):
     Image.fromarray(PHOTO).save(tmp_path / "photo.png", exif=exif)
     with Image.open(tmp_path / "photo.png") as image:
         np.testing.assert_array_equal(oriented(PHOTO, flag), np.asarray(ImageOps.exif_transpose(image)))
+
+
+def deep_png(pixels, color_type):
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, color_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
+def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, color_type):
+    pixels = np.random.default_rng(1).integers(0, 65536, (7, 9, channels), np.uint16)
+    (tmp_path / "deep.png").write_bytes(deep_png(pixels, color_type))
+    colors, alpha = read_image(tmp_path / "deep.png")
+    expected = pixels.astype(np.float32) / np.float32(65535)
+    np.testing.assert_array_equal(colors, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
+    if channels in (2, 4):
+        np.testing.assert_array_equal(alpha, expected[..., -1])
+    else:
+        assert alpha is None
+
+
+@pytest.mark.parametrize("mode", ["L", "1", "P", "RGB", "CMYK", "LA", "RGBA"])
+def test_every_common_image_mode_is_read(tmp_path, mode):
+    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(mode)
+    suffix = "jpg" if mode == "CMYK" else "png"
+    image.save(tmp_path / f"x.{suffix}")
+    colors, alpha = read_image(tmp_path / f"x.{suffix}")
+    assert colors.shape == (8, 9, 3) and (alpha is not None) == mode.endswith("A")
+    if mode != "CMYK":  # JPEG is lossy
+        np.testing.assert_allclose(colors, np.asarray(image.convert("RGB")) / 255, atol=1e-6)

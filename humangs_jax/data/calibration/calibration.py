@@ -172,7 +172,9 @@ def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel
     return dataclasses.replace(calibration, cameras=cameras, observations=observations, up="+y", pixel_centers="half")
 
 
-def _convert(camera, scale, turn, shift):
+def _convert(
+    camera: CalibratedCamera, scale: float | int, turn: Float[np.ndarray, "3 3"], shift: float
+) -> CalibratedCamera:
     K, pose = camera.K.copy(), camera.cam_from_world.copy()
     K[:2, 2] += shift
     pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
@@ -304,13 +306,15 @@ def undistort_person(
     near = ((source > low) & (source < np.add(high, 2 * step))).all(axis=-1)
     if not near.any():
         return nobody
-    slices = [np.flatnonzero(near.any(axis=axis)) * step for axis in (1, 0)]
+    slices = [np.flatnonzero(np.logical_or.reduce(near, axis=axis)) * step for axis in (1, 0)]
     box = tuple(slice(max(0, each[0] - step), each[-1] + step) for each in slices)
     both = undistort(np.dstack([1 - image, mask]), K, coefficients, 0.0, (box[0], box[1]))
     return 1 - both[..., :3], both[..., 3]
 
 
-def _in_photo(pixels, K, coefficients):
+def _in_photo(
+    pixels: Float[np.ndarray, "*n 2"], K: Float[np.ndarray, "3 3"], coefficients: Float[np.ndarray, "5"]
+) -> Float[np.ndarray, "*n 2"]:
     """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not show them."""
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
     source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]
@@ -318,7 +322,7 @@ def _in_photo(pixels, K, coefficients):
     return source
 
 
-def _squared_reach(coefficients):
+def _squared_reach(coefficients: Sequence[float] | np.ndarray) -> float:
     """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
     roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3])  # 1 / r^2, so that tiny coefficients are not divided by

@@ -93,7 +93,7 @@ def split_video(path: Path, folder: Path, every: int = 1, most: int | None = Non
         return before + count * size
 
 
-def _check_pixels(pixels, count, width, height):
+def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
     what = f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
     check_limit("video_pixels", pixels, what)
 
@@ -146,7 +146,7 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
                 listener.join()
 
 
-def _ffmpeg(path, filters):
+def _ffmpeg(path: Path, filters: str) -> list[str]:
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
@@ -156,7 +156,7 @@ def _ffmpeg(path, filters):
     return [*command, "-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
 
 
-def _run(path, folder, select, most):
+def _run(path: Path, folder: Path, select: str, most: int) -> int:
     """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there are."""
     command = [*_ffmpeg(path, f"select={select}"), "-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
     _finished(path, command, folder)  # in the folder: its path may hold a % of its own
@@ -165,7 +165,7 @@ def _run(path, folder, select, most):
     return count
 
 
-def _finished(path, command, folder=None):
+def _finished(path: Path, command: Sequence[str], folder: Path | None = None) -> bytes:
     """What ffmpeg writes to its standard output."""
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
@@ -176,7 +176,7 @@ def _finished(path, command, folder=None):
     return done.stdout
 
 
-def _said(path, text):
+def _said(path: Path, text: bytes) -> ValueError:
     """The error that ffmpeg tells of."""
     said = " ".join(text.decode(errors="replace").split()) or "no frame"
     return ValueError(said.replace(f"file:{path.resolve()}", path.name))
