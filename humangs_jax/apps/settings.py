@@ -49,9 +49,8 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.runtime import RUNTIMES, Runtime
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.refine import refine_with_report
-from humangs_jax.refinement.report import Refinement
-from humangs_jax.rendering.drawing import Rendering
+from humangs_jax.refinement.refine import Refinement, refine_with_report
+from humangs_jax.rendering.splatting import Rendering
 
 MEASURED = "tradeoff.md"
 KIND = "humangs_jax settings"

@@ -90,7 +90,7 @@ def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
         return False
     share = lambda votes: votes[0] / max(sum(votes), 1)
-    return share(shift.votes) >= AGREE_ALONE and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE
+    return bool(share(shift.votes) >= AGREE_ALONE and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE)
 
 
 def _moved(mask: Float[np.ndarray, "h w"], shift: _Shift) -> Float[np.ndarray, "h w"]:

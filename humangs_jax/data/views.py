@@ -201,7 +201,7 @@ def cropped(capture: Capture, size: int) -> Capture:
         if not high.any():
             return capture
         side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
-        boxes.append((*((low + high - side) // 2), side))
+        boxes.append((*((low + high - side) // 2).tolist(), side))
     if min(side for *_, side in boxes) >= max(height, width):
         return capture
     cut = lambda array, fill: np.stack(
