@@ -32,7 +32,7 @@ from experiments.subjects import (
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
-from humangs_jax.data.loader import ViewSampling, find_captures
+from humangs_jax.data.loading import ViewSampling, find_captures
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
 from humangs_jax.data.views import gaussian_body, select_views

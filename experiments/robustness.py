@@ -45,7 +45,7 @@ from humangs_jax.avatar.reconstruct import fit_buffers
 from humangs_jax.body.library import load_body
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import apply_humangs, init_humangs

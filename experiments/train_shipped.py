@@ -64,7 +64,7 @@ def main(
 
     from experiments.grow import fit_variables
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.loader import find_captures
+    from humangs_jax.data.loading import find_captures
     from humangs_jax.network.weights import load_weights
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.writer import Layout, write_set

@@ -18,7 +18,7 @@ from experiments.results import markdown_table
 from experiments.training import random_networks, settings, written_subject
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.data.views import SubjectViews, gaussian_body
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.losses import FAR_SURFACE, ray_spread

@@ -124,7 +124,7 @@ def measure_preprocessing(
 
 def examples(people: Any, inputs: int, targets: int, count: int) -> Any:
     """Samples through the loader, one by one."""
-    from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, ViewSampling
+    from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, ViewSampling
 
     sampling = ViewSampling(input_counts=(inputs,), target_count=targets)
     source = CaptureSource(PeopleCache(people, limit_bytes=0), sampling, SIZE, SIZE)

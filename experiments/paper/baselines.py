@@ -15,7 +15,7 @@ from experiments.paper.bench import PAINTED, PHOTOS, TARGETS, load_networks, mea
 from experiments.results import markdown_table, significant, write_json
 from experiments.systems import SYSTEMS
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loader import CaptureCache, ViewSampling
+from humangs_jax.data.loading import CaptureCache, ViewSampling
 from humangs_jax.data.loading.captures import find_captures, subject_order, view_generator
 from humangs_jax.data.loading.examples import draw_views
 from humangs_jax.evaluation.cases import draw_painted_body, find_people, painted_body

@@ -22,7 +22,7 @@ from experiments.systems.grouped import GroupReader
 from experiments.systems.pixel_queries import QueryDecoder
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.targets import show_targets
-from humangs_jax.data.loader import ViewSampling
+from humangs_jax.data.loading import ViewSampling
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.evaluation.cases import Predicted, draw_views
 from humangs_jax.evaluation.run import evaluate

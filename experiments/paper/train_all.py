@@ -35,7 +35,7 @@ from experiments.results import markdown_table, write_json
 from experiments.subjects import file_digest
 from humangs_jax.body.library import load_body
 from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.loader import CaptureCache, find_captures
+from humangs_jax.data.loading import CaptureCache, find_captures
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.seeds import seeds_of
 from humangs_jax.people.writer import Layout, write_set

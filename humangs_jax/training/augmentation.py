@@ -14,7 +14,7 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Key
 from humangs_jax.core.configuration import Range, Share, Spread, configuration
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera

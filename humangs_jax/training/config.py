@@ -20,7 +20,7 @@ from humangs_jax.core.configuration import (
     configuration,
     knob,
 )
-from humangs_jax.data.loader import ViewSampling
+from humangs_jax.data.loading import ViewSampling
 from humangs_jax.io.reading import read_configuration
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network import presets

@@ -19,7 +19,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Key, PyTree, Scalar
 from humangs_jax.core.progress import bar, watched
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.reading import parse_json, read_text, reading
 from humangs_jax.losses.loss_networks import LossNetworks

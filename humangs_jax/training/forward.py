@@ -12,7 +12,7 @@ from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.losses.losses import ray_spread
 from humangs_jax.network.config import HumanGSConfig

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from humangs_jax.core.progress import bar, say
-from humangs_jax.data.loader import Waiting
+from humangs_jax.data.loading import Waiting
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading
 from humangs_jax.training.state import TrainState

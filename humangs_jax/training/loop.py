@@ -23,7 +23,7 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.progress import say, stage
-from humangs_jax.data.loader import Waiting
+from humangs_jax.data.loading import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png

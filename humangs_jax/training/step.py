@@ -14,7 +14,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.losses import squared_error, surface_distance, tightness, translucency

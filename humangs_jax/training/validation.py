@@ -13,7 +13,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.data.loader import Example, ViewSampling
+from humangs_jax.data.loading import Example, ViewSampling
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent
 from humangs_jax.losses.perceptual import lpips

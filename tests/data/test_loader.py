@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.loader import (
+from humangs_jax.data.loading import (
     CaptureCache,
     CaptureSource,
     Loader,

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting
+from humangs_jax.data.loading import Example, Loader, Mixture, Source, Waiting
 from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
 from humangs_jax.data.sets import DATA_SET, SYNTHETIC, begin_set
 from humangs_jax.data.views import SubjectViews
@@ -131,7 +131,7 @@ SHARDED = """
 import jax, json, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tests.data.test_loading import CountingSource, same
-from humangs_jax.data.loader import Loader
+from humangs_jax.data.loading import Loader
 mesh = jax.make_mesh((2, 2), ("data", "model"), axis_types=(AxisType.Auto,) * 2)
 plain = Loader(CountingSource(), 4, seed=1)
 for spec in (PartitionSpec("data"), PartitionSpec(("data", "model")), PartitionSpec()):

@@ -13,7 +13,7 @@ import humangs_jax as hg
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.evaluation.cases import Case, Predicted, _short_names, find_people, spread_views
 from humangs_jax.io.images import write_png

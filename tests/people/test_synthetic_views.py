@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.people import cameras, seeds, writer

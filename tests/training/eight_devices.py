@@ -56,7 +56,7 @@ def a_training_step():
     one device that works on all 8 at once."""
     from training_cases import tube, write_subject
 
-    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, find_captures
+    from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, find_captures
     from humangs_jax.losses.loss_networks import LossNetworks
     from humangs_jax.network.humangs import init_humangs
     from humangs_jax.training.config import tiny

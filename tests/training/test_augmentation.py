@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.geometry.camera import project
 from humangs_jax.training import augmentation
 from humangs_jax.training.augmentation import Augmentation, augment_cameras, augment_photos, augment_views

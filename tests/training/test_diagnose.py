@@ -15,7 +15,7 @@ from training_cases import without_upsampler
 
 from experiments.training import random_weights
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.humangs import init_humangs

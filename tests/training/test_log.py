@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Waiting, subject_order
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, Waiting, subject_order
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.config import tiny
 from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after

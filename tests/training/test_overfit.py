@@ -14,7 +14,7 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, standardize
 from humangs_jax.network import presets
 from humangs_jax.network.config import paper_parts

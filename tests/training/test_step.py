@@ -15,7 +15,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import reconstruct_views
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks

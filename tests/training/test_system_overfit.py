@@ -7,7 +7,7 @@ import pytest
 from system_cases import small_system
 
 from experiments.systems import ONE_PHOTO
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.training.config import tiny

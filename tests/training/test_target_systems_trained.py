@@ -10,7 +10,7 @@ import pytest
 from target_cases import DRIVEN, PIXELS, small
 
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loader import Example
+from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, standardize
 from humangs_jax.evaluation.cases import Case
 from humangs_jax.evaluation.run import evaluate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step

@@ -19,7 +19,7 @@ from humangs_jax.data.photos import check_photos, read_checked, read_description
 from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import check_image, to_uint8
 
-logger = logging.getLogger("humangs_jax.data.loader")
+logger = logging.getLogger("humangs_jax.data.loading")
 
 
 def find_captures(root: str | Path) -> tuple[Path, ...]:

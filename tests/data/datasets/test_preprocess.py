@@ -28,7 +28,7 @@ from humangs_jax.data.datasets.bodies import posed_people
 from humangs_jax.data.datasets.scene_list import read_scene_list
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.formats import DATASETS, DataSetFormat
-from humangs_jax.data.loader import find_captures
+from humangs_jax.data.loading import find_captures
 from humangs_jax.data.preprocess import run as set_run
 from humangs_jax.data.preprocess.rendering import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
 from humangs_jax.data.preprocess.run import Settings, preprocess

@@ -28,7 +28,7 @@ from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_peo
 from humangs_jax.data.datasets.scene_list import read_evaluation, read_scene_list, scene_frames
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
-from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, Source, ViewSampling
+from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, Source, ViewSampling
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import write_json
