@@ -1,6 +1,6 @@
 """Speed against accuracy in one value: how many photos, how the network runs, how long refinement takes, how frames are drawn.
 
-`PRESETS` are points of the front that experiments/tradeoff/sweep.py has measured (docs/tradeoff.md). `tune` finds one for a
+`PRESETS` are points of the front that python -m experiments tradeoff has measured (docs/tradeoff.md). `tune` finds one for a
 machine and a person within a budget. The front (assets/front.json) says which settings are worth trying, how good they are, and
 how their times compare. A few are measured, the cheapest first; times of the others are extrapolated from those. What is chosen
 has been measured itself, twice: other programs come and go. Times are without compilation.

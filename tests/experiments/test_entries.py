@@ -20,6 +20,7 @@ CASES = {
     "loss_gradients": "--quick",
     "masks": PEOPLE,
     "paper_claims": "",
+    "people_faults": "--subjects 1 --described 20 --size 64 --plots FOLDER/a.png",
     "reconstruction_benchmark": "--preset tiny --size 64 --views 2 --repeats 1 --memory 1 --memory-size 64",
     "reconstruction_savings": "--preset tiny --size 64 --views 2 --repeats 1",
     "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",

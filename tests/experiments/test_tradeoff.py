@@ -2,9 +2,9 @@
 
 import json
 
+from experiments import tradeoff_report as report
 from experiments.results import REPOSITORY
-from experiments.tradeoff import report
-from experiments.tradeoff.points import points
+from experiments.tradeoff_points import points
 
 
 def row(name, reconstruct, frame, psnr, start="network", steps=0):

@@ -1,12 +1,13 @@
 """The scripts that look at people: faults are found where they are made, sheets are drawn."""
 
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
 
-from experiments.people import check_people, contact_sheets
+from experiments import generator as check_people
+from experiments.generator_poses import people_sheets
+from experiments.harness import call
 from humangs_jax.people import cameras
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.people.subject import make_subject
@@ -60,15 +61,14 @@ def test_holes_in_cloth_are_counted(body, posed, camera):
 
 
 @pytest.mark.slow
-def test_a_sheet_is_drawn_twice_alike(tmp_path, monkeypatch):
+def test_a_sheet_is_drawn_twice_alike(tmp_path):
     import imageio.v3 as iio
 
     files = []
     for name in ("one", "two"):
         out = tmp_path / name
         sizes = ["--subjects", "1", "--scale", "0.3", "--suffix", ".png", "--sheets", "front_back"]
-        monkeypatch.setattr(sys, "argv", ["contact_sheets.py", "--out", str(out), *sizes])
-        contact_sheets.main()
+        assert call(people_sheets, ["--out", str(out), *sizes]) == 0
         files.append(out / "people_front_back.png")
     assert files[0].read_bytes() == files[1].read_bytes()
     picture = iio.imread(files[0])

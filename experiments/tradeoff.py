@@ -1,36 +1,57 @@
 """Speed against accuracy of the whole path: what each knob costs in decibels and takes in time, memory and bytes.
 
-    python experiments/tradeoff/sweep.py --json OUT [--subjects 2] [--only KNOB ...] [--page docs/tradeoff.md]
-        [--image docs/images/tradeoff] [--front]
-
-The points are those of `points.py`. Quality is the mean over people of the split "tradeoff", whom nothing else has seen:
-PSNR, SSIM and foreground PSNR, of new views in the pose of the photos and in unseen poses. Photos and true images have
-512 pixels; frames of another size are brought to 512 before they are compared. Times are
-CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
-programs stretch wall times by far more. Refinement is counted in steps, which do not depend on the load either. Compilation
-does not count. Memory: what making the avatar or refining it adds to the process at its peak.
-
-Every point is written as it is measured; a later run continues. `--front` writes the Pareto front to
-humangs_jax/assets/front.json, where `humangs tune` finds it. About 50 minutes on one core.
+Quality is the mean over people of the split "tradeoff", whom nothing else has seen: new views in the pose of the photos and in
+unseen poses. Photos and true images have 512 pixels; frames of another size are brought to 512 before they are compared. Times
+are CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
+programs stretch wall times by far more. Refinement is counted in steps. Compilation does not count. Memory: what making the
+avatar or refining it adds.
 """
 
-import argparse
 import dataclasses
 import functools
 import itertools
 import json
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import write_json
-from experiments.subjects import TASKS, shipped_digest
-from experiments.timing import prepare_process, timed
+from experiments import tradeoff_report
+from experiments.harness import Run, entry
+from experiments.reconstruction import random_variables
+from experiments.refinement import random_start
+from experiments.results import REPOSITORY, markdown_table, write_json
+from experiments.subjects import (
+    TASKS,
+    EvaluationSubject,
+    HeldOut,
+    make_evaluation_subject,
+    ring_positions,
+    score_tasks,
+    shipped_digest,
+)
+from experiments.timing import timed
+from experiments.tradeoff_points import DEFAULT, points
+from humangs_jax.apps.settings import reconstruct_with
+from humangs_jax.avatar.frames import capture_views, draw, splatting_of, without_unseen
+from humangs_jax.avatar.reconstruct import reconstruct_batch
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.library import load_body
+from humangs_jax.core.configuration import config_to_json
+from humangs_jax.core.processes import peak_memory
+from humangs_jax.core.progress import bar
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.evaluation.cases import draw_painted_body, painted_body
+from humangs_jax.io.images import resized
+from humangs_jax.network.presets import published
+from humangs_jax.network.weights import SHIPPED, load_weights
+from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of
+from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
+from humangs_jax.refinement.refine import refine_with_report
 
 SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
@@ -41,72 +62,91 @@ FRAMES = 10
 QUALITY = ("psnr", "ssim", "psnr_fg")
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, required=True, help="points that are there are not measured again")
-    parser.add_argument("--subjects", type=int, default=2, help="how many people")
-    parser.add_argument("--people", type=Path, help="folder where rendered people are kept for later runs")
-    parser.add_argument("--iterations", type=int, default=2, help="timed iterations of making an avatar")
-    parser.add_argument("--only", nargs="+", help="knobs to measure")
-    parser.add_argument("--page", type=Path, help="page whose tables are written")
-    parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
-    parser.add_argument("--front", action="store_true", help="write humangs_jax/assets/front.json")
-    arguments = parser.parse_args()
-    prepare_process()
-    result = sweep(arguments)
-    from experiments.tradeoff import report
+@entry
+def tradeoff(
+    run: Run,
+    out: Path,
+    subjects: int = 2,
+    people: Path | None = None,
+    iterations: int = 2,
+    only: tuple[str, ...] = (),
+    image: Path | None = None,
+    front: bool = False,
+) -> None:
+    """Speed against accuracy of the whole path: some 70 settings, their front, and presets. 50 minutes on one core.
 
-    report.write(result, arguments.page, arguments.image, arguments.front)
+    Tables: tradeoff, tradeoff_presets, tradeoff_naive, tradeoff_growth.
 
-
-def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Measures what the file does not have."""
-    import jax
-    from tqdm import tqdm
-
-    from experiments.tradeoff.points import points
-
-    path, subjects, only = arguments.json, arguments.subjects, arguments.only
+    Options:
+    out: JSON of the points; those that are there are not measured again
+    subjects: how many people
+    people: folder where rendered people are kept for later runs
+    iterations: timed iterations of making an avatar
+    only: knobs to measure
+    image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
+    front: write humangs_jax/assets/front.json, where `humangs tune` finds it
+    """
     settings = settings_of()
-    result = json.loads(path.read_text()) if path.exists() else {}
+    result = json.loads(out.read_text()) if out.exists() else {}
     if result.get("settings") != settings:
         result = {"settings": settings, "points": {}, "growth": {}}
-    rows, wanted = result["points"], [p for p in points() if only is None or p.knob in only]
+    rows, wanted = result["points"], [p for p in points() if not only or p.knob in only]
     for each in wanted:
         if described(each) != rows.get(each.name, {}).get("what"):
             rows[each.name] = {"what": described(each), "people": []}
     missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
     missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
-    if not missing and result["growth"]:
-        return result
-    bench = Bench(subjects, arguments.people, arguments.iterations)
-    # all of one person, then the next: times are of the first
-    for done, (i, each) in enumerate(tqdm(missing, desc="points")):
-        if done % 20 == 19:
-            jax.clear_caches()  # compiled programs hold memory maps, of which Linux gives a process 65,530
-        bench.measure(each, i, rows[each.name])
-        write_json(path, result)
-    if not result["growth"]:
-        result["growth"] = bench.growth()
-        write_json(path, result)
-    return result
+    if missing or not result["growth"]:
+        bench = Bench(subjects, people, iterations)
+        # all of one person, then the next: times are of the first
+        for done, (i, each) in enumerate(bar(missing, desc="points", unit="point")):
+            if done % 20 == 19:
+                jax.clear_caches()  # compiled programs hold memory maps, of which Linux gives a process 65,530
+            bench.measure(each, i, rows[each.name])
+            write_json(out, result)
+        result["growth"] = result["growth"] or bench.growth()
+        write_json(out, result)
+    tradeoff_report.show(run, result, image, front)
+
+
+CLOSE, DECIBELS = 0.2, 0.3
+
+
+@entry
+def presets(run: Run, people: Path | None = None) -> int:
+    """Whether the presets still take and gain what docs/results/tradeoff.json says, in one run on this machine.
+
+    Times as shares of the default point's, in turns with it, have to be within 20 % of those of the sweep, and the PSNR of the
+    first person within 0.3 dB. Exit status 1 if one is not. 10 minutes on one core.
+
+    Options:
+    people: folder where rendered people are kept
+    """
+    claimed = json.loads((REPOSITORY / "docs/results/tradeoff.json").read_text())["numbers"]
+    if claimed["settings"] != settings_of():
+        print("the sweep was made with other weights or people: run `tradeoff` again")
+        return 1
+    bench, table = Bench(1, people, iterations=3), []
+    for point in (point for point in points() if point.knob == "preset"):
+        row: dict[str, Any] = {"people": []}
+        bench.measure(point, 0, row)
+        said, names = claimed["points"][point.name], ("PSNR, same pose", "PSNR, unseen poses")
+        pairs = [(key, row[key], said[key], abs(row[key] / said[key] - 1) <= CLOSE) for key in ("reconstruct", "frame")]
+        found = [row["people"][0][task]["psnr"] for task in TASKS]
+        pairs += [(n, a, b, abs(a - b) <= DECIBELS) for n, a, b in zip(names, found, said["first_person"], strict=True)]
+        table += [[point.name, n, f"{a:.2f}", f"{b:.2f}", "yes" if ok else "NO"] for n, a, b, ok in pairs]
+    run.show(markdown_table(["preset", "claim", "now", "sweep", "holds"], table, "llrrl"))
+    return int(any(cells[-1] == "NO" for cells in table))
 
 
 def settings_of() -> dict[str, Any]:
     """What all points depend on."""
-    from humangs_jax.network.weights import SHIPPED
-    from humangs_jax.people.seeds import GENERATOR_VERSION
-
     return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, **SHOTS}
 
 
 def described(point) -> dict[str, Any]:
     """A point as data; what it says of weights decides whether an earlier measurement still counts."""
-    from humangs_jax.core.configuration import config_to_json
-    from humangs_jax.refinement.learned import SHIPPED
-
-    learned = {"refiner": shipped_digest(SHIPPED)} if point.settings.refine_iterations else {}
+    learned = {"refiner": shipped_digest(SHIPPED_REFINER)} if point.settings.refine_iterations else {}
     return learned | {
         "knob": point.knob,
         "size": point.size,
@@ -117,9 +157,6 @@ def described(point) -> dict[str, Any]:
 
 def person_of(seed: int, body, folder: Path | None):
     """A person with photos and held-out views; rendered once where there is a folder to keep them in."""
-    from experiments.subjects import EvaluationSubject, HeldOut, make_evaluation_subject, ring_positions
-    from humangs_jax.data.capture import load_capture, save_capture
-
     place = folder / str(seed) if folder else None
     if place is None or not (place / "held_out" / "capture.json").exists():
         held_out = HeldOut(SHOTS["held_out"], SHOTS["poses"], SHOTS["pose_views"])
@@ -138,11 +175,6 @@ class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
     def __init__(self, subjects: int, people: Path | None, iterations: int = 2):
-        from experiments.tradeoff.points import DEFAULT
-        from humangs_jax.body.library import load_body
-        from humangs_jax.network.weights import load_weights
-        from humangs_jax.people.seeds import seeds_of
-
         self.subjects, (self.variables, self.config) = subjects, load_weights()
         body = load_body()
         seeds = seeds_of("tradeoff", 0, subjects)
@@ -172,11 +204,6 @@ class Bench:
 
     def made(self, point, i):
         """The avatar of a point; those that only differ in how they are drawn are made once."""
-        from experiments.refinement import random_start
-        from humangs_jax.apps.settings import reconstruct_with
-        from humangs_jax.evaluation.cases import painted_body
-        from humangs_jax.refinement.refine import refine_with_report
-
         settings = dataclasses.replace(point.settings, splat="as_trained", prune=False)
         key = (settings, point.start, i)
         if key not in self.kept:
@@ -196,11 +223,6 @@ class Bench:
 
     def scores(self, point, avatar, person):
         """Scores by task, of frames brought to the size of the truth."""
-        from experiments.subjects import score_tasks
-        from humangs_jax.avatar.frames import capture_views, draw
-        from humangs_jax.evaluation.cases import draw_painted_body
-        from humangs_jax.io.images import resized
-
         truth = person.held_out
         if point.start == "painted body":
             return score_tasks(draw_painted_body(avatar, truth), truth)
@@ -214,8 +236,6 @@ class Bench:
 
     def pruned(self, point, avatar, held_out):
         """Without what the held-out views do not show, where the point says so."""
-        from humangs_jax.avatar.frames import capture_views, without_unseen
-
         if not point.settings.prune:
             return avatar
         poses, cameras = capture_views(avatar, held_out)
@@ -224,17 +244,12 @@ class Bench:
     @staticmethod
     def how(point, avatar):
         """How the point draws."""
-        from humangs_jax.avatar.frames import splatting_of
-        from humangs_jax.avatar.shot import Shot
-
         return splatting_of(point.settings.shot(Shot()), avatar)
 
     # Times and memory ------------------------------------------------------------------------------------------------
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
-        from humangs_jax.apps.settings import reconstruct_with
-
         return reconstruct_with(
             settings.unrefined, self.variables, self.config, self.person(0).inputs(settings.views or 4)
         )
@@ -245,8 +260,6 @@ class Bench:
 
     def make_times(self, point) -> dict[str, Any]:
         """Time of making the avatar over the default's, with refinement; the default's ms; peak memory, MiB."""
-        from humangs_jax.core.processes import peak_memory
-
         settings, usual = point.settings, self.default.settings
         same = (settings.views, settings.runtime) == (usual.views, usual.runtime)
         pairs = []
@@ -265,9 +278,6 @@ class Bench:
 
     def refining(self, settings) -> tuple[float, float | None]:
         """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
-        from humangs_jax.core.processes import peak_memory
-        from humangs_jax.refinement.refine import refine_with_report
-
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
         run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
@@ -287,10 +297,6 @@ class Bench:
 
     def frames(self, avatar, size, how, cameras=None):
         """Frames without end, in the poses of the held-out views."""
-        import jax
-
-        from humangs_jax.avatar.frames import capture_views, draw
-
         poses, views = capture_views(avatar, self.person(0).held_out)
         cameras = views.resized(size, size) if cameras is None else cameras
         turns = lambda: itertools.cycle(range(len(poses.rotations)))
@@ -300,8 +306,6 @@ class Bench:
 
     def painted_times(self) -> dict[str, Any]:
         """Of the painted body: the mesh with its colors, rasterized."""
-        from humangs_jax.evaluation.cases import draw_painted_body, painted_body
-
         photos, held_out = self.person(0).inputs(4), self.person(0).held_out
         one = held_out.select([0])
         colors = painted_body(photos)
@@ -319,11 +323,6 @@ class Bench:
 
     def published(self, point) -> dict[str, Any]:
         """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
-        from experiments.reconstruction import random_variables
-        from humangs_jax.apps.settings import reconstruct_with
-        from humangs_jax.core.processes import peak_memory
-        from humangs_jax.network.presets import published
-
         config = published().with_conventions(image_size=256)
         variables, photos = random_variables(config), self.person(0).inputs(4)
         make = lambda: reconstruct_with(point.settings, variables, config, photos)
@@ -340,12 +339,6 @@ class Bench:
 
     def growth(self) -> dict[str, Any]:
         """People in a batch over one person, and a large frame with the person in a small box over a frame of the box."""
-        import jax
-        import jax.numpy as jnp
-
-        from humangs_jax.avatar.reconstruct import reconstruct_batch
-        from humangs_jax.core.pytree import replace
-
         photos = [self.person(i).inputs(4) for i in range(self.subjects)]
         batch = {}
         for count in (1, 2, 4):
@@ -367,9 +360,3 @@ class Bench:
         iterations = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
         times = np.median(iterations, axis=0)
         return {"batch": batch, "box": {str(side): float(t / times[0]) for side, t in zip(boxes, times, strict=True)}}
-
-
-if __name__ == "__main__":
-    started = time.perf_counter()
-    main()
-    print(f"took {(time.perf_counter() - started) / 60:.0f} min")

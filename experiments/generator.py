@@ -1,30 +1,22 @@
-"""Count what is wrong with synthetic people, and how much they differ.
+"""What is wrong with synthetic people, and how much they differ."""
 
-    python experiments/people/check_people.py --subjects 200 --json OUT [--described 1000]
-        [--plots docs/images/people_diversity.png]
-
-Faults are counted in images of random poses from random cameras, as shares of the person's pixels:
-- poking: skin that lies inside of a hem and is seen although the OUTER side of cloth is at most 6 cm behind it on the same ray,
-  of which skin deeper than 1 cm inside of the hem is `poking_deep`. (Skin seen up a sleeve or under a skirt has the inner side
-  of cloth behind it: no fault.) Skin that cloth covers well is not in the mesh at all and cannot poke: see `hollow`.
-- inside: all skin deeper than 1 cm inside of a hem that is seen at all, rightly (up a sleeve) or not: an upper bound.
-- hollow: the INNER side of cloth is seen where the naked body, posed alike, would be at least 1 cm nearer: one looks through a
-  neckline, a cuff or a hem into empty clothes.
-- gaps: the background is seen where the naked body would be.
-Diversity is that of descriptions (`person.describe`: shape, garments, colors, hair; a millisecond each) and of images
-(foreground share, colors as seen, joint angles). 1,000 descriptions take 3 s, 1,000 subjects with images about 15 minutes
-on 2 CPU cores. Expected: poking below 0.1 %.
-"""
-
-import argparse
 import collections
-import json
-import sys
+import colorsys
+import dataclasses
 from pathlib import Path
-from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, publish, write_json
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry, figure
+from experiments.results import markdown_table
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.people import cameras, kinematics, rendering
+from humangs_jax.people.rendering import padded
+from humangs_jax.people.subject import describe, make_subject
+from humangs_jax.people.writer import sample_pose
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
@@ -51,73 +43,62 @@ DEEP = 0.01
 SHARE_BINS = 40
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--subjects", type=int, default=50, help="people that are built, posed and rendered")
-    parser.add_argument("--described", type=int, default=1000, help="people whose descriptions are counted")
-    parser.add_argument("--poses", type=int, default=2, help="poses of every built person")
-    parser.add_argument("--views", type=int, default=2, help="cameras around every pose")
-    parser.add_argument("--size", type=int, default=256, help="side of the pictures")
-    parser.add_argument("--first", type=int, default=0, help="first seed (training people by default)")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="page whose tables people_faults and people_diversity are written")
-    parser.add_argument("--plots", type=Path, help="write the diversity plots here")
-    parser.add_argument("--worst", type=int, default=0, help="print the seeds with most faults")
-    arguments = parser.parse_args()
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """Options:
+    subjects: people that are built, posed and rendered
+    described: people whose descriptions are counted
+    poses: of every built person
+    views: cameras around every pose
+    size: side of the pictures
+    first: first seed (training people by default)
+    """
 
-    from humangs_jax.body.library import load_body
+    subjects: int = 1000
+    described: int = 1000
+    poses: int = 1
+    views: int = 1
+    size: int = 256
+    first: int = 0
 
+
+@entry
+def people_faults(run: Run, options: Looked = Looked(), plots: Path | None = None, worst: int = 0) -> None:
+    """What is wrong with synthetic people, and how much they differ; also the table people_diversity.
+
+    Faults are counted in images of random poses from random cameras, as shares of the person's pixels. Skin seen up a sleeve or
+    under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in the mesh at all and
+    cannot poke: see hollow. Diversity is that of descriptions (a millisecond each) and of images. 1,000 descriptions take 3 s,
+    1,000 subjects with images about 15 minutes on 2 CPU cores. Expected: poking below 0.1 %.
+
+    Options:
+    plots: the diversity plots
+    worst: print so many seeds with most faults
+    """
     body = load_body()
-    people = describe_all(body, arguments)
-    seen, faults = look_at_all(body, arguments)
-    result = {**people["numbers"], **seen["numbers"]}
-    print(json.dumps(result, indent=1))
-    for name in ("poking", "hollow", "gaps"):
-        if arguments.worst:
-            ranked = sorted(faults, key=lambda row: -row[name])[: arguments.worst]
-            print(name, [(row["seed"], row["pose"], f"{row[name]:.2%}") for row in ranked])
-    if arguments.json:
-        write_json(arguments.json, result)
-    if arguments.page:
-        publish(arguments.page, "people_faults", faults_table(result), {name: result[name] for name in FAULTS})
-        publish(arguments.page, "people_diversity", diversity_table(result), result)
-    if arguments.plots:
-        draw(arguments.plots, people, seen)
-
-
-def faults_table(result: dict[str, Any]) -> str:
-    """One row for each fault."""
+    people = describe_all(body, options)
+    seen, faults = look_at_all(body, options)
+    result = people["numbers"] | seen["numbers"]
+    for name in ("poking", "hollow", "gaps") if worst else ():
+        ranked = sorted(faults, key=lambda row: -row[name])[:worst]
+        print(name, [(row["seed"], row["pose"], f"{row[name]:.2%}") for row in ranked])
     rows = []
     for name, definition in FAULTS.items():
-        mean, worst, poses = (result[name][key] for key in ("mean", "worst", "poses_above_0.1_percent"))
-        rows.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{worst:.2%}", f"{poses:.1%}"])
-    return markdown_table(["fault", "definition", "mean", "worst pose", "poses above 0.1 %"], rows, "lllll")
-
-
-def diversity_table(result: dict[str, Any]) -> str:
-    """One row for each measure."""
+        mean, most, poses = (result[name][key] for key in ("mean", "worst", "poses_above_0.1_percent"))
+        rows.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{poses:.1%}"])
+    text = markdown_table(["fault", "definition", "mean", "worst pose", "poses above 0.1 %"], rows, "lllll")
+    run.show(text, {name: result[name] for name in FAULTS})
     rows = [[label, *(f"{x:.{digits}f}" for x in result[name].values())] for name, (label, digits) in SPREADS.items()]
-    header = [
-        f"of {result['described']:,} people",
-        "mean",
-        "standard deviation",
-        "least",
-        "5 %",
-        "median",
-        "95 %",
-        "most",
-    ]
-    return markdown_table(header, rows, "l" * len(header))
+    marks = ["mean", "standard deviation", "least", "5 %", "median", "95 %", "most"]
+    header = [f"of {result['described']:,} people", *marks]
+    run.show(markdown_table(header, rows, "l" * len(header)), result, "people_diversity")
+    if plots:
+        draw(plots, people, seen)
 
 
-def describe_all(body, arguments):
+def describe_all(body, options):
     """Counts and spreads over descriptions."""
-    import numpy as np
-
-    from humangs_jax.people.subject import describe
-
-    people = [describe(arguments.first + i, body) for i in range(arguments.described)]
+    people = [describe(options.first + i, body) for i in range(options.described)]
     kinds = collections.Counter(g.kind for p in people for g in p.garments)
     patterns = collections.Counter(g.fabric.pattern for p in people for g in p.garments)
     cuts = collections.Counter(p.haircut.cut for p in people)
@@ -155,27 +136,21 @@ def describe_all(body, arguments):
     }
 
 
-def look_at_all(body, arguments):
+def look_at_all(body, options):
     """Faults, foreground shares, colors and angles of built people; and a row of faults for every pose."""
-    import numpy as np
-
-    from humangs_jax.people import cameras, rendering
-    from humangs_jax.people.subject import make_subject
-    from humangs_jax.people.writer import sample_pose
-
     rows, colors, angles, shares = [], np.zeros((12, 4, 4)), [], []
-    for i in range(arguments.subjects):
-        seed = arguments.first + i
+    for i in range(options.subjects):
+        seed = options.first + i
         subject = make_subject(seed, body)
-        for pose in range(arguments.poses):
+        for pose in range(options.poses):
             posed = sample_pose(subject, pose)
             angles.append(np.linalg.norm(posed.rotations, axis=1))
             rng = np.random.default_rng([seed, 77, pose])
             batch = cameras.cameras_around(
-                rng, posed.vertices, cameras.spread_azimuths(rng, arguments.views), arguments.size
+                rng, posed.vertices, cameras.spread_azimuths(rng, options.views), options.size
             )
             counts = np.zeros(1 + len(FAULTS))
-            for k in range(arguments.views):
+            for k in range(options.views):
                 counts += count_faults(body, posed, batch[k])
                 if pose == 0 and k == 0:
                     image, mask = rendering.render_view(posed, batch[k])
@@ -186,7 +161,7 @@ def look_at_all(body, arguments):
                 | dict(zip(FAULTS, counts[1:] / counts[0], strict=True))
             )
     pixels = np.asarray([row["pixels"] for row in rows])
-    numbers: dict = {"built": arguments.subjects, "pictures": len(rows) * arguments.views}
+    numbers: dict = {"built": options.subjects, "pictures": len(rows) * options.views}
     for name in FAULTS:
         each = np.asarray([row[name] for row in rows])
         numbers[name] = {
@@ -202,13 +177,6 @@ def look_at_all(body, arguments):
 
 def count_faults(body, posed, camera):
     """(6,) pixels of the person, then those of FAULTS."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.people.rendering import padded
-    from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
-
     subject = posed.subject
     faces, materials = subject.surface.faces, subject.face_materials
     everything = rasterize_mesh(*padded(posed.vertices, faces), camera)
@@ -235,14 +203,12 @@ def count_faults(body, posed, camera):
 
 
 def _faces_the_eye(vertices, faces, eye):
-    import numpy as np
 
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
 
 
 def _spread(values):
-    import numpy as np
 
     marks = dict(
         zip(
@@ -257,8 +223,6 @@ def _spread(values):
 
 def _hsv(colors):
     """(n, 3) hue, saturation, value of (n, 3) colors."""
-    import numpy as np
-
     high, low = colors.max(-1), colors.min(-1)
     chroma = np.maximum(high - low, 1e-9)
     r, g, b = colors.T
@@ -268,8 +232,6 @@ def _hsv(colors):
 
 def _hues(colors):
     """Shares of dyes: neutral ones and 12 hues."""
-    import numpy as np
-
     hue, saturation, _ = _hsv(colors).T
     colored = saturation > 0.15
     counts = np.bincount((hue[colored] * 12).astype(int) % 12, minlength=12)
@@ -280,8 +242,6 @@ def _hues(colors):
 
 def _color_histogram(pixels):
     """(12, 4, 4) counts of hue, saturation, value, each image with the same weight."""
-    import numpy as np
-
     cells = np.minimum((_hsv(pixels) * [12, 4, 4]).astype(int), [11, 3, 3])
     counts = np.zeros((12, 4, 4))
     np.add.at(counts, tuple(cells.T), 1 / max(len(pixels), 1))
@@ -290,57 +250,29 @@ def _color_histogram(pixels):
 
 def draw(file, people, seen):
     """One image of eight plots."""
-    import colorsys
-
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import numpy as np
-
-    from humangs_jax.people import kinematics as poses
-
-    figure = plt.figure(figsize=(17, 9.5))
-    grid = figure.add_gridspec(2, 5)
-    stature, years, build, share, worn, woven, hue, bent = (
-        figure.add_subplot(grid[at])
-        for at in ((0, 0), (0, 1), (0, 2), (0, 3), (slice(None), 4), (1, 0), (1, slice(1, 3)), (1, 3))
-    )
     male, numbers = np.asarray(people["male"]), people["numbers"]
-    for values, name, ax in ((people["stature"], "stature, m", stature), (people["years"], "years", years)):
-        ax.hist([values[male], values[~male]], 30, stacked=True, label=["men", "women"])
-        ax.set_xlabel(name)
-        ax.legend()
-    build.scatter(people["stature"], people["betas"][:, 2], s=6, c=np.clip(people["skin"], 0, 1))
-    build.set_xlabel("stature, m")
-    build.set_ylabel("weight coefficient (colour: skin)")
-    share.hist(seen["shares"], SHARE_BINS)
-    share.set_xlabel("share of the picture that is person")
-    for kinds, ax, label in (
-        (numbers["garments"], worn, f"garments among {numbers['described']} people"),
-        (
-            {k: v for k, v in numbers["patterns"].items() if k != "plain"},
-            woven,
-            f"patterns (plain: {numbers['patterns']['plain']})",
-        ),
-    ):
-        ax.barh(list(kinds)[::-1], list(kinds.values())[::-1])
-        ax.margins(y=0.01)
-        ax.set_xlabel(label)
-    shares = seen["colours"].sum((1, 2)) / seen["colours"].sum()
-    hue.bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
-    hue.set_xlabel("hue of the person's pixels")
-    joints = {"hip": poses.LEFT_HIP, "knee": poses.LEFT_KNEE, "shoulder": poses.LEFT_SHOULDER, "elbow": poses.LEFT_ELBOW,
-              "spine": poses.SPINE2, "neck": poses.NECK}  # fmt: skip
-    bent.boxplot(
-        [np.rad2deg(seen["angles"][:, j]) for j in joints.values()], tick_labels=list(joints), showfliers=False
-    )
-    bent.set_ylabel("joint angle, degrees")
-    bent.tick_params(axis="x", labelrotation=45)
-    figure.tight_layout()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=70)
-
-
-if __name__ == "__main__":
-    main()
+    with figure(file, 4, (17, 9.5), rows=2) as axes:
+        (stature, years, build, share), (worn, woven, hue, bent) = axes
+        for values, name, ax in ((people["stature"], "stature, m", stature), (people["years"], "years", years)):
+            ax.hist([values[male], values[~male]], 30, stacked=True, label=["men", "women"])
+            ax.set_xlabel(name)
+            ax.legend()
+        build.scatter(people["stature"], people["betas"][:, 2], s=6, c=np.clip(people["skin"], 0, 1))
+        build.set(xlabel="stature, m", ylabel="weight coefficient (color: skin)")
+        share.hist(seen["shares"], SHARE_BINS)
+        share.set_xlabel("share of the picture that is person")
+        patterned = {k: v for k, v in numbers["patterns"].items() if k != "plain"}
+        for kinds, ax, label in (
+            (numbers["garments"], worn, f"garments among {numbers['described']} people"),
+            (patterned, woven, f"patterns (plain: {numbers['patterns']['plain']})"),
+        ):
+            ax.barh(list(kinds)[::-1], list(kinds.values())[::-1])
+            ax.set_xlabel(label)
+        shares = seen["colours"].sum((1, 2)) / seen["colours"].sum()
+        hue.bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
+        hue.set_xlabel("hue of the person's pixels")
+        joints = {"hip": kinematics.LEFT_HIP, "knee": kinematics.LEFT_KNEE, "shoulder": kinematics.LEFT_SHOULDER}
+        joints |= {"elbow": kinematics.LEFT_ELBOW, "spine": kinematics.SPINE2, "neck": kinematics.NECK}
+        angles = [np.rad2deg(seen["angles"][:, j]) for j in joints.values()]
+        bent.boxplot(angles, tick_labels=list(joints), showfliers=False)
+        bent.set_ylabel("joint angle, degrees")

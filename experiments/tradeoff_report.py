@@ -1,19 +1,13 @@
-"""The page, the images and the front of a sweep, from its JSON.
+"""The tables, the images and the front of `tradeoff`."""
 
-python experiments/tradeoff/report.py --json OUT [--page docs/tradeoff.md] [--image docs/images/tradeoff] [--front]
-"""
-
-import argparse
-import json
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import REPOSITORY, markdown_table, publish, significant, write_json
+from experiments.harness import Run, figure, means
+from experiments.results import REPOSITORY, markdown_table, significant, write_json
 
 FRONT = REPOSITORY / "humangs_jax" / "assets" / "front.json"
 SIZE = 512
@@ -27,34 +21,31 @@ KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "naive": "#7f8c8d"}
 Row = dict[str, Any]
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, required=True, help="written by sweep.py")
-    parser.add_argument("--page", type=Path, help="page whose tables are written")
-    parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
-    parser.add_argument("--front", action="store_true", help="write humangs_jax/assets/front.json")
-    arguments = parser.parse_args()
-    write(json.loads(arguments.json.read_text()), arguments.page, arguments.image, arguments.front)
-
-
-def write(result: dict[str, Any], page: Path | None, image: Path | None, front: bool) -> None:
-    """Everything that is asked for; the table of the presets is printed."""
-    measured = {name: found for name, found in result["points"].items() if "reconstruct" in found}
-    result = result | {"points": measured}
+def show(run: Run, result: dict[str, Any], image: Path | None, front: bool) -> None:
+    """All tables, and what is asked for."""
+    result = result | {"points": {name: found for name, found in result["points"].items() if "reconstruct" in found}}
     rows = rows_of(result)
-    print(preset_table(rows, result))
     if front:
         write_json(FRONT, front_file(rows, result))
-    if page:
-        publish(page, "tradeoff", point_table(rows, result), result)
-        publish(page, "tradeoff_presets", preset_table(rows, result))
-        publish(page, "tradeoff_naive", naive_table(rows))
-        publish(page, "tradeoff_growth", growth_table(rows, result))
+    run.show(point_table(rows, result), kept(result), "tradeoff")
+    run.show(preset_table(rows, result), table="tradeoff_presets")
+    run.show(naive_table(rows), table="tradeoff_naive")
+    run.show(growth_table(rows, result), table="tradeoff_growth")
     if image:
-        for key in ("reconstruct", "frame"):
-            name = "reconstruction" if key == "reconstruct" else "frames"
+        for key, name in (("reconstruct", "reconstruction"), ("frame", "frames")):
             draw(rows, key, image.with_name(f"{image.name}_{name}.png"))
+
+
+def kept(result: dict[str, Any]) -> dict[str, Any]:
+    """With means in place of the rows of people, and of presets the PSNR of the first person, which `presets` compares."""
+    points = {}
+    for name, found in result["points"].items():
+        people = found.get("people") or []
+        points[name] = {key: value for key, value in found.items() if key != "people"}
+        points[name] |= {"people": len(people)} | (means(people) if people else {})
+        if found["what"]["knob"] == "preset" and people:
+            points[name]["first_person"] = [people[0][task]["psnr"] for task in TASKS]
+    return result | {"points": points}
 
 
 def rows_of(result: dict[str, Any]) -> list[Row]:
@@ -62,9 +53,11 @@ def rows_of(result: dict[str, Any]) -> list[Row]:
     rows = []
     for name, found in result["points"].items():
         row = {"name": name.removeprefix("preset "), **found["what"], **found}
-        for task in TASKS:
-            scores = [person[task] for person in found["people"]]
-            row[task] = {key: float(np.mean([score[key] for score in scores])) for key in SCORES} if scores else None
+        people = found["people"]  # of docs/results: their number, and means
+        of_people = (
+            {task: found.get(task) for task in TASKS} if isinstance(people, int) else means(people) if people else {}
+        )
+        row |= {task: of_people.get(task) for task in TASKS}
         rows.append(row)
     return rows
 
@@ -120,10 +113,14 @@ def front_file(rows: list[Row], result: dict[str, Any]) -> dict[str, Any]:
 # Tables ------------------------------------------------------------------------------------------------------------------
 
 
+def _count(people):
+    return people if isinstance(people, int) else len(people)
+
+
 def about(result: dict[str, Any]) -> str:
     """Of which weights, people and machine the numbers are."""
     default = result["points"]["default"]
-    people, took = len(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
+    people, took = _count(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
     return (
         f"Weights with SHA-256 {result['settings']['weights'][:16]}...; {people} of the people kept for this "
         f'(split "tradeoff"). CPU times of all threads are shares of the default point\'s, in turns with it: {took} and '
@@ -249,38 +246,21 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
 
 def draw(rows: list[Row], key: str, path: Path) -> None:
     """PSNR of both tasks against a time, with the front."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     points = compared(rows)
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), sharex=True)
-    for axis, (task, title) in zip(axes, TASKS.items(), strict=True):
-        for name, color in KINDS.items():
-            chosen = [row for row in points if kind(row) == name]
-            marker = "x" if name == "naive" else "o"
-            x, y = [row[key] for row in chosen], [row[task]["psnr"] for row in chosen]
-            axis.scatter(x, y, s=18, color=color, marker=marker, label=name)
-        steps = staircase([(row[key], row[task]["psnr"]) for row in points if row["start"] == "network"])
-        axis.step(*zip(*steps, strict=True), where="post", color="k", lw=0.8, label="front")
-        for row in points:
-            if row["knob"] == "preset" or row["name"] == "default":
-                axis.annotate(
-                    row["name"], (row[key], row[task]["psnr"]), fontsize=7, xytext=(3, 3), textcoords="offset points"
-                )
-        axis.set(
-            xscale="log",
-            title=title,
-            ylabel="PSNR, dB",
-            xlabel=f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default",
-        )
-        axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=7)
-    figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with figure(path, 2, (10, 4.4)) as axes:
+        for axis, (task, title) in zip(axes, TASKS.items(), strict=True):
+            for name, color in KINDS.items():
+                chosen = [row for row in points if kind(row) == name]
+                x, y = [row[key] for row in chosen], [row[task]["psnr"] for row in chosen]
+                axis.scatter(x, y, s=18, color=color, marker="x" if name == "naive" else "o", label=name)
+            steps = staircase([(row[key], row[task]["psnr"]) for row in points if row["start"] == "network"])
+            axis.step(*zip(*steps, strict=True), where="post", color="k", lw=0.8, label="front")
+            for row in (row for row in points if row["knob"] == "preset" or row["name"] == "default"):
+                at = row[key], row[task]["psnr"]
+                axis.annotate(row["name"], at, fontsize=7, xytext=(3, 3), textcoords="offset points")
+            label = f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default"
+            axis.set(xscale="log", title=title, ylabel="PSNR, dB", xlabel=label)
+        axes[0].legend(fontsize=7)
 
 
 def staircase(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -291,7 +271,3 @@ def staircase(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
             steps.append((x, y))
             highest = y
     return steps
-
-
-if __name__ == "__main__":
-    main()
