@@ -31,9 +31,9 @@ from experiments.timing import medians, peak_rss_mb
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import transform
-from humangs_jax.rendering import schedules, tiling
+from humangs_jax.rendering import compositing, tiling
 from humangs_jax.rendering.compositing import pack_splats
-from humangs_jax.rendering.projection import project, squared_reach
+from humangs_jax.rendering.projection import project
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import SplatConfig, plan_buffers, render, render_views
 from humangs_jax.rendering.tiling import TileGrid, image_to_tiles, sort_into_tiles, tiles_to_image
@@ -116,7 +116,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
         return program(*arguments)
 
     def footprints(projected, opacities, order):
-        ellipses = tiling.footprints(projected, squared_reach(opacities, config.alpha_min))
+        ellipses = tiling.footprints(projected, tiling.squared_reach(opacities, config.alpha_min))
         return jax.tree.map(lambda plane: plane[order], ellipses)
 
     def rows(projected, gaussians, order):
@@ -140,7 +140,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     lists = stage("lists", lambda *a: sort_into_tiles(*a, grid.tiles, count), pairs.tiles, pairs.splats)
     splats = stage("rows", rows, projected, gaussians, order)
     forward, backward = (
-        getattr(schedules, f"{way}_by_{order_of_work}")(grid, config) for way in ("forward", "backward")
+        getattr(compositing, f"{way}_by_{order_of_work}")(grid, config) for way in ("forward", "backward")
     )
     features, transmittance, used, _ = stage("composite", forward, splats, *lists)
     stage("image", lambda f, t: (tiles_to_image(f, grid), tiles_to_image(t[:, None], grid)), features, transmittance)

@@ -20,22 +20,32 @@ alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0 whe
 sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give the gradient of a splat's shape. They are matrix products
 with monomials about the tile's centre that are moved to the splat's centre afterwards.
 
-The order of the work is that of `schedules`: small blocks on CPUs, fat chunks elsewhere. `vmap` joins the tiles of all images
-into one list of tiles, so a batch is one call with more tiles, not a loop of masked loops.
+The order of the work is a schedule, one for CPUs and one for accelerators. Pixels and splats are taken relative to a tile's
+centre, so that nothing is lost in float32 however large the image. `vmap` joins the tiles of all images into one list of tiles: a
+batch is one call with more tiles, not a loop of masked loops.
 """
 
 import functools
+import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Float
-from humangs_jax.rendering import schedules
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.rendering.projection import ProjectedGaussians
-from humangs_jax.rendering.schedules import R00, R01, R11
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.tiling import TileGrid, TileLists
+from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, expand
+
+X, Y, R00, R01, R11, LOG_OPACITY = range(6)
+FEATURES = slice(6, 10)
+FEATURE_COUNT = 4
+"""Red, green, blue and z. A constant: XLA unrolls them."""
+SPLAT_WIDTH = 10
+EXACT = lax.Precision.HIGHEST
+"""GPUs and TPUs would otherwise round the factors of a product to 10 or 8 bits."""
 
 
 def pack_splats(
@@ -61,7 +71,9 @@ def composite(
 
 
 def _composite_fwd(splats, lists, grid, config):
-    features, transmittance, lengths, peaks = _scheduled("forward", grid, config, splats, *lists)
+    features, transmittance, lengths, peaks = _scheduled(
+        forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
+    )
     return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
 
 
@@ -69,16 +81,16 @@ def _composite_bwd(grid, config, saved, cotangents):
     splats, lists, features, transmittance, lengths = saved
     g, g_transmittance, _ = cotangents
     total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
-    sums = _scheduled("backward", grid, config, splats, lists.items, lists.starts, lengths, g, total)
+    arrays = splats, lists.items, lists.starts, lengths, g, total
+    sums = _scheduled(backward_by_blocks, backward_by_chunks, grid, config, *arrays)
     return _splat_gradients(splats, sums), None
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-def _scheduled(direction, grid, config, *arrays):
-    on_cpu, elsewhere = (getattr(schedules, f"{direction}_by_{order}")(grid, config) for order in ("blocks", "chunks"))
-    return lax.platform_dependent(*arrays, cpu=on_cpu, default=elsewhere)
+def _scheduled(on_cpu, elsewhere, grid, config, *arrays):
+    return lax.platform_dependent(*arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config))
 
 
 def _splat_gradients(splats, sums):
@@ -90,3 +102,397 @@ def _splat_gradients(splats, sums):
     u, v = r00 * ex + r01 * ey, r11 * ey
     columns = [2 * r00 * u, 2 * (r01 * u + r11 * v), -2 * ux, -2 * uy, -2 * vy, e]
     return jnp.concatenate([jnp.stack(columns, axis=-1), sums[:, 6:]], axis=-1)
+
+
+# What both schedules share -------------------------------------------------------------------------------------------
+
+
+def joined_over_batch(function):
+    """Under `vmap`, a function of (splats, items, starts, more per tile...) is called once, with the tiles of all images.
+
+    Its outputs must be arrays per tile or per splat; those of the images then follow one another.
+    """
+    function = jax.custom_batching.custom_vmap(function)
+
+    @function.def_vmap
+    def rule(size, batched, *args):
+        args = [a if b else jnp.broadcast_to(a, (size, *a.shape)) for a, b in zip(args, batched, strict=True)]
+        splats, items, starts, *rest = args
+        image = jnp.arange(size, dtype=jnp.int32)[:, None]
+        args = [splats, items + image * splats.shape[1], starts + image * items.shape[1], *rest]
+        out = function(*(a.reshape(-1, *a.shape[2:]) for a in args))
+        out = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return function
+
+
+def take_chunk(
+    splats: Float[Array, "g 10"],
+    items: Int[Array, " capacity"],
+    starts: Int[Array, " b"],
+    counts: Int[Array, " b"],
+    tiles: Int[Array, " b"],
+    grid: TileGrid,
+    k: int,
+) -> tuple[Int[Array, "b k"], Float[Array, "b k 10"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
+    """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on `tiles`.
+
+    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw alphas (0 past the end).
+    """
+    slot = jnp.arange(k, dtype=jnp.int32)
+    item = items.at[starts[:, None] + slot].get(mode="clip")
+    item = jnp.where(slot < counts[:, None], item, splats.shape[0])
+    row = lax.optimization_barrier(splats.at[item].get(mode="clip"))
+    place = tiles % grid.tiles  # of its image, if several were joined
+    cx, cy = (
+        (axis * grid.tile_size).astype(row.dtype)[:, None] + 0.5 * grid.tile_size
+        for axis in (place % grid.columns, place // grid.columns)
+    )
+    centre = jnp.stack([row[..., X] - cx, row[..., Y] - cy])
+    inside = jnp.arange(k, dtype=jnp.int32) < counts[:, None]
+    x, y = centre
+    r00, r01, r11 = row[..., R00], row[..., R01], row[..., R11]
+    offsets = jnp.asarray(grid.offsets(row.dtype))
+    u = (r00 * x + r01 * y)[..., None] - r00[..., None] * offsets[0] - r01[..., None] * offsets[1]
+    v = (r11 * y)[..., None] - r11[..., None] * offsets[1]
+    raw = jnp.where(inside[..., None], jnp.exp(row[..., LOG_OPACITY, None] - u * u - v * v), 0.0)
+    return item, row, centre, raw
+
+
+def largest_weights(weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid) -> Float[Array, "b k"]:
+    """Of each splat on the pixels of its tile that lie inside the image."""
+    place = tiles % grid.tiles
+    x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())
+    left = jnp.minimum(grid.width - place % grid.columns * grid.tile_size, grid.tile_size)
+    above = jnp.minimum(grid.height - place // grid.columns * grid.tile_size, grid.tile_size)
+    inside = (x < left[:, None]) & (y < above[:, None])
+    return jnp.max(jnp.where(inside[:, None], weights, 0.0), axis=2)
+
+
+def visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
+    """Alpha from its raw value: clamped above, 0 if it is skipped."""
+    return jnp.where(raw < config.alpha_min, 0.0, jnp.minimum(raw, config.alpha_max))
+
+
+def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
+    """(p, 6): 1, x, y, x^2, xy, y^2 of a tile's pixels, from its centre."""
+    x, y = grid.offsets(dtype)
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def moments_about_splat(
+    moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
+) -> Float[Array, "*b 6"]:
+    """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat - centre)."""
+    m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
+    about = [m, mx - x * m, my - y * m, mxx - 2 * x * mx + x * x * m, mxy - x * my - y * mx + x * y * m]
+    return jnp.stack([*about, myy - 2 * y * my + y * y * m], axis=-1)
+
+
+def product(a: Float[Array, "*b m p"], b: Float[Array, "*b p n"], config: SplatConfig) -> Float[Array, "*b m n"]:
+    """Sums over pixels as a matrix product, with factors of `config.matmul_precision`."""
+    if config.matmul_precision == "float32":
+        return jnp.matmul(a, b, precision=EXACT)
+    narrow = a.astype(config.matmul_precision), b.astype(config.matmul_precision)
+    return jnp.matmul(*narrow, preferred_element_type=a.dtype)
+
+
+# Small blocks of tiles, for CPUs -------------------------------------------------------------------------------------
+
+# Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks until the longest list ends or
+# all its pixels have. A chunk's arrays (block, chunk, pixels) stay in the cache, and its chain of splats is unrolled, once for
+# each thing that the loop carries: XLA makes of each ONE kernel that runs the chain in registers. Once a pixel has stopped, the
+# loop carries -T, which keeps the final T. Compile with `core.compiling.compiler_options`: sharing small kernels out over threads
+# costs more than it gains, and the barriers have to be kept.
+
+LINK = 2
+"""Splats of a chunk whose chain one kernel of the backward pass runs. Its outputs for splat j redo the chain from the
+last stored link on; storing T after every splat costs more than that."""
+
+
+@functools.lru_cache
+def forward_by_blocks(grid: TileGrid, config: SplatConfig):
+    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), used parts of the lists (t,), peaks (g,).
+
+    peaks: largest w of each splat; 0 unless `config.visibility`.
+    """
+    block, k, stop = config.block, config.chunk, config.transmittance_stop
+
+    @joined_over_batch
+    def forward(splats, items, starts, counts):
+        dtype, t = splats.dtype, counts.shape[0]
+        blocks = blocks_by_length(counts, block)
+
+        def draw(b, carry):
+            *out, peaks = carry
+            tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
+            start, count = _lists_of(tile, starts, counts)
+
+            def body(carry):
+                i, transmittance, features, lengths, live, peaks = carry
+                item, row, _, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
+                raw = lax.optimization_barrier(raw)  # one exp per pair: XLA would fuse it into each of its consumers
+                alpha = lax.optimization_barrier(visible_alpha(raw, config))
+                before, weights = transmittance[:, None], []
+                for j in range(k):
+                    after = before * (1 - alpha[:, None, j])
+                    weight = jnp.where(after > stop, alpha[:, None, j] * before, 0.0)
+                    features = features + weight * row[:, j, FEATURES, None]
+                    weights.append(weight)
+                    before = after
+                if config.visibility:
+                    highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
+                    peaks = peaks.at[item].max(highest, mode="drop")
+                for j in range(k):
+                    after = transmittance * (1 - alpha[:, j])
+                    transmittance = jnp.where(after > stop, after, jnp.minimum(transmittance, -transmittance))
+                lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
+                live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
+                return i + 1, transmittance, features, lengths, live, peaks
+
+            ones = jnp.ones((block, grid.pixels), dtype)
+            zeros = jnp.zeros((block, FEATURE_COUNT, grid.pixels), dtype)
+            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks
+            _, transmittance, features, lengths, _, peaks = lax.while_loop(lambda carry: jnp.any(carry[4]), body, carry)
+            results = features, jnp.abs(transmittance), lengths
+            drawn = (o.at[tile].set(r, mode="drop", unique_indices=True) for o, r in zip(out, results, strict=True))
+            return *drawn, peaks
+
+        out = (
+            jnp.zeros((t, FEATURE_COUNT, grid.pixels), dtype),
+            jnp.ones((t, grid.pixels), dtype),
+            jnp.zeros(t, jnp.int32),
+            jnp.zeros(splats.shape[0], dtype),
+        )
+        return lax.fori_loop(0, blocks.used, draw, out)
+
+    return forward
+
+
+@functools.lru_cache
+def backward_by_blocks(grid: TileGrid, config: SplatConfig):
+    """(splats, items, starts, lengths, g (t, 4, p), Q (t, p)) -> sums over pixels for each splat, (g, 10).
+
+    They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
+    """
+    block, k, stop = config.block, config.chunk_backward, config.transmittance_stop
+
+    @joined_over_batch
+    def backward(splats, items, starts, lengths, cotangents, totals):
+        dtype = splats.dtype
+        powers = jnp.asarray(monomials(grid, dtype))
+        blocks = blocks_by_length(lengths, block)
+
+        def draw(b, sums):
+            tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
+            start, count = _lists_of(tile, starts, lengths)
+            g, total = (v.at[tile].get(mode="fill", fill_value=0) for v in (cotangents, totals))
+            trips = (jnp.max(count) + k - 1) // k
+
+            def body(carry):
+                i, transmittance, seen, sums = carry
+                item, row, offset, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
+                raw = lax.optimization_barrier(raw)  # one exp per pair: XLA would fuse it into each of its consumers
+                weights, slopes = [], []
+                for j in range(k):
+                    if j > 0 and j % LINK == 0:
+                        transmittance, seen = lax.optimization_barrier((transmittance, seen))
+                    alpha = visible_alpha(raw[:, j], config)
+                    after = transmittance * (1 - alpha)
+                    weight = jnp.where(after > stop, alpha * transmittance, 0.0)
+                    along = sum(row[:, j, 6 + c, None] * g[:, c] for c in range(FEATURE_COUNT))
+                    seen = seen + weight * along
+                    slope = (along * transmittance - (total - seen) / (1 - alpha)) * raw[:, j]
+                    slopes.append(jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0))
+                    weights.append(weight)
+                    transmittance = after
+                weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
+                # matrix products: XLA's row reductions are slow on CPUs
+                moments = product(slopes.reshape(block * k, -1), powers, config).reshape(block, k, 6)
+                features = product(weights, jnp.moveaxis(g, 1, 2), config)
+                rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
+                return i + 1, transmittance, seen, sums.at[item].add(rows, mode="drop")
+
+            ones = jnp.ones((block, grid.pixels), dtype)
+            carry = 0, ones, jnp.zeros_like(ones), sums
+            return lax.while_loop(lambda carry: carry[0] < trips, body, carry)[3]
+
+        return lax.fori_loop(0, blocks.used, draw, jnp.zeros((splats.shape[0], SPLAT_WIDTH), dtype))
+
+    return backward
+
+
+def _lists_of(tile, starts, counts):
+    return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
+
+
+# Few fat steps, for accelerators -------------------------------------------------------------------------------------
+
+# A sequential step costs microseconds there, however little it does. Every list is cut into chunks of `CHUNK` splats, and the
+# chunks of ALL lists of all images of a batch, B at once, become arrays (B, k, p) (p pixels of a tile). The chain over a list
+# becomes products, because along it only log T accumulates:
+#     log T_j = (sum of the log(1 - alpha) before the chunk) + (strict lower triangle (k, k)) @ log(1 - alpha)
+# The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of the same list", plus what the list
+# that runs on from the step before has come to, all that steps hand on. The sums over i <= j of w_i g . f_i of the backward pass
+# are formed by the same two products. T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by rounding
+# only while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before the stop. A NaN spreads to other tiles
+# of its step. Scatter-adds: on a GPU the last bit may differ between runs.
+
+CHUNK = 64
+"""Splats of a list in one chunk. The triangular product costs 2 CHUNK flops per pair; half a chunk per list is padding."""
+STEP_BYTES = 64 << 20
+"""Largest size of one of the arrays (B, k, p) of a step; the backward pass holds five of them."""
+STEP_CHUNKS = 2048
+"""Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular one at this B."""
+_LOG_ZERO = -1e3
+"""Stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, and its product with 0 is 0 and not NaN."""
+
+
+class Chunks(NamedTuple):
+    """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have tile t and count 0.
+
+    tiles, starts, counts: of each chunk. ends: how far into its list it reaches. steps: of B chunks that hold any.
+    """
+
+    tiles: Int[Array, " s"]
+    starts: Int[Array, " s"]
+    counts: Int[Array, " s"]
+    ends: Int[Array, " s"]
+    steps: Int[Array, ""]
+
+
+def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step: int) -> Chunks:
+    """Cuts lists, of `capacity` items at most together, into chunks; their number is a multiple of `step`."""
+    t = counts.shape[0]
+    most = _most_chunks(capacity, t)
+    slots = expand((counts + CHUNK - 1) // CHUNK, -(-most // step) * step)
+    slot = jnp.arange(slots.source.shape[0], dtype=jnp.int32)
+    tile = jnp.where(slot < slots.needed, slots.source, t)
+    skipped = (slot - slots.first[slots.source]) * CHUNK
+    start, count = (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
+    inside = jnp.clip(count - skipped, 0, CHUNK)
+    return Chunks(tile, start + skipped, inside, skipped + inside, (slots.needed + step - 1) // step)
+
+
+@functools.lru_cache
+def forward_by_chunks(grid: TileGrid, config: SplatConfig):
+    """As `forward_by_blocks`."""
+    log_stop = _log_stop(config)
+
+    @joined_over_batch
+    def forward(splats, items, starts, counts):
+        dtype, t, p = splats.dtype, counts.shape[0], grid.pixels
+        step = _chunks_per_step(grid, dtype, items.shape[0], t)
+        chunks = cut(starts, counts, items.shape[0], step)
+
+        def draw(i, carry):
+            sums, lengths, peaks, tail = carry
+            c = _slice(chunks, i, step)
+            item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            alpha, fading = _fading(raw, config)
+            before, since = _sums_before(fading, c.tiles, tail)
+            live = before[:, None] + since + fading > log_stop
+            weights = jnp.where(live, alpha * jnp.exp(before[:, None] + since), 0.0)
+            features = [jnp.sum(weights * row[..., f, None], axis=1) for f in range(FEATURES.start, FEATURES.stop)]
+            parts = jnp.stack([*features, jnp.sum(jnp.where(live, fading, 0.0), axis=1)], axis=1)
+            sums = sums.at[c.tiles].add(parts, mode="drop", indices_are_sorted=True)
+            reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
+            lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
+            if config.visibility:
+                peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
+            return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
+
+        sums, lengths = jnp.zeros((t, FEATURE_COUNT + 1, p), dtype), jnp.zeros(t, jnp.int32)
+        carry = sums, lengths, jnp.zeros(splats.shape[0], dtype), _no_tail(t, p, dtype)
+        sums, lengths, peaks, _ = lax.fori_loop(0, chunks.steps, draw, carry)
+        return sums[:, :FEATURE_COUNT], jnp.exp(sums[:, FEATURE_COUNT]), lengths, peaks
+
+    return forward
+
+
+@functools.lru_cache
+def backward_by_chunks(grid: TileGrid, config: SplatConfig):
+    """As `backward_by_blocks`."""
+    log_stop = _log_stop(config)
+
+    @joined_over_batch
+    def backward(splats, items, starts, lengths, cotangents, totals):
+        dtype, t, p = splats.dtype, lengths.shape[0], grid.pixels
+        step = _chunks_per_step(grid, dtype, items.shape[0], t)
+        chunks = cut(starts, lengths, items.shape[0], step)
+        powers = jnp.asarray(monomials(grid, dtype))
+
+        def draw(i, carry):
+            sums, faded_tail, seen_tail = carry
+            c = _slice(chunks, i, step)
+            item, row, centre, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            g, total = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (cotangents, totals))
+            alpha, fading = _fading(raw, config)
+            before, since = _sums_before(fading, c.tiles, faded_tail)
+            transmittance = jnp.exp(before[:, None] + since)
+            live = before[:, None] + since + fading > log_stop
+            weights = jnp.where(live, alpha * transmittance, 0.0)
+            along = sum(row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(FEATURE_COUNT))
+            gained = weights * along
+            seen_before, seen_since = _sums_before(gained, c.tiles, seen_tail)
+            behind = total[:, None] - (seen_before[:, None] + seen_since + gained)
+            slopes = (along * transmittance - behind / (1 - alpha)) * raw
+            slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
+
+            moments = product(slopes.reshape(-1, p), powers, config).reshape(step, CHUNK, 6)
+            features = product(weights, jnp.moveaxis(g, 1, 2), config)
+            rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
+            tails = (
+                _tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))
+            )
+            return sums.at[item].add(rows, mode="drop"), *tails
+
+        sums, tail = jnp.zeros((splats.shape[0], SPLAT_WIDTH), dtype), _no_tail(t, p, dtype)
+        return lax.fori_loop(0, chunks.steps, draw, (sums, tail, tail))[0]
+
+    return backward
+
+
+def _most_chunks(capacity, t):
+    """Full chunks, and for each list one that is not."""
+    return capacity // CHUNK + min(t, capacity)
+
+
+def _chunks_per_step(grid, dtype, capacity, t):
+    fitting = STEP_BYTES // (CHUNK * grid.pixels * np.dtype(dtype).itemsize)
+    return max(1, min(fitting, STEP_CHUNKS, _most_chunks(capacity, t)))
+
+
+def _log_stop(config):
+    return math.log(config.transmittance_stop) if config.transmittance_stop > 0 else -math.inf
+
+
+def _slice(chunks, i, step):
+    parts = (lax.dynamic_slice_in_dim(v, i * step, step) for v in chunks[:-1])
+    return Chunks(*parts, chunks.steps)
+
+
+def _fading(raw, config):
+    alpha = visible_alpha(raw, config)
+    return alpha, jnp.maximum(jnp.log1p(-alpha), _LOG_ZERO)
+
+
+def _sums_before(x, tiles, tail):
+    """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there to each splat."""
+    b, k, _ = x.shape
+    triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
+    since = lax.optimization_barrier(jnp.matmul(triangle, x, precision=EXACT))
+    chunk = jnp.arange(b)
+    earlier = (tiles[:, None] == tiles) & (chunk[:, None] > chunk)
+    before = jnp.matmul(earlier.astype(x.dtype), since[:, -1] + x[:, -1], precision=EXACT)
+    tail_tile, tail_sum = tail
+    return before + jnp.where((tiles == tail_tile)[:, None], tail_sum, 0.0), since
+
+
+def _tail(tiles, before, through):
+    return tiles[-1], before[-1] + through[-1, -1]
+
+
+def _no_tail(t, p, dtype):
+    return jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype)

@@ -33,7 +33,6 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_variance
 from humangs_jax.rendering.splat_config import (
-    ALPHA_MIN,
     DEFAULT_CONFIG,
     EPS2D,
     LARGEST_FOOTPRINT,
@@ -151,13 +150,6 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
     return project(
         gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats
     )
-
-
-def squared_reach(opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN) -> Float[Array, " g"]:
-    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
-    opacities = lax.stop_gradient(opacities)
-    seen = opacities > alpha_min
-    return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
 
 
 def _covariance(m0, m1, eps2d):

@@ -28,10 +28,9 @@ from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.io.images import contact_sheet, named_color, png_bytes
-from humangs_jax.rendering.compositing import composite, pack_splats
+from humangs_jax.rendering.compositing import FEATURE_COUNT, composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
-from humangs_jax.rendering.schedules import FEATURE_COUNT
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import (
     TileGrid,

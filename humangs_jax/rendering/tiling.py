@@ -32,8 +32,8 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int, Shaped, UInt
-from humangs_jax.rendering.projection import ProjectedGaussians, squared_reach
-from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.projection import ProjectedGaussians
+from humangs_jax.rendering.splat_config import ALPHA_MIN, SplatConfig
 
 SUM_LIMIT = 1 << 30
 """Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""
@@ -360,6 +360,13 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
         key = ((value[order] >> shift) & ((1 << digit) - 1)) << bits | position
         order = order[(sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)]
     return order
+
+
+def squared_reach(opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN) -> Float[Array, " g"]:
+    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
+    opacities = lax.stop_gradient(opacities)
+    seen = opacities > alpha_min
+    return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
 
 
 def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Footprints:

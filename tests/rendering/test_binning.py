@@ -9,7 +9,7 @@ import pytest
 from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians
 
 from humangs_jax.rendering import tiling
-from humangs_jax.rendering.projection import project, squared_reach
+from humangs_jax.rendering.projection import project
 from humangs_jax.rendering.tiling import TileGrid
 
 GRID = TileGrid(WIDTH, HEIGHT, 4)
@@ -19,7 +19,7 @@ SAMPLES = 400
 
 @jax.jit
 def ellipses(gaussians):
-    return tiling.footprints(project(gaussians, camera(np.float32)), squared_reach(gaussians.opacities))
+    return tiling.footprints(project(gaussians, camera(np.float32)), tiling.squared_reach(gaussians.opacities))
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))

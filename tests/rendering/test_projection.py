@@ -12,8 +12,8 @@ from humangs_jax.geometry import camera as pinhole
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.rendering import projection
 from humangs_jax.rendering.gaussians import Gaussians, covariances
-from humangs_jax.rendering.projection import squared_reach
 from humangs_jax.rendering.splat_config import EPS2D, SPLAT_PRESETS
+from humangs_jax.rendering.tiling import squared_reach
 
 project = jax.jit(projection.project, static_argnames=("near", "eps2d", "jacobian_margin"))
 
