@@ -136,6 +136,7 @@ BAD_USAGE = {
     "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
     "refine me.npz someone --out me.npz": "--out me.npz: is read by this command",
     "animate me.npz --azimuth nan": "--azimuth nan: expected -36,000 to 36,000",
+    "preprocess thuman in --out x --body b.npz --views 0": "--views 0",
     "animate nobody.npz --out a.txt": "--out a.txt: expected a name ending in",
     "demo --refine inf": "--refine inf: expected at least 0",
     "synth --workers 0": "--workers 0: expected at least 1",

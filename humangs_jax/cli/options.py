@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from humangs_jax.core.configuration import Range, at_least, check_range, marks_in
 from humangs_jax.core.progress import say
+from humangs_jax.core.registry import alternatives
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
@@ -93,7 +94,7 @@ def require_file(
 ) -> None:
     """A file with one of the suffixes can be written to that path. read: what the command reads. Raises: UsageError."""
     if path.suffix.lower() not in suffixes:
-        raise UsageError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
+        raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder: expected the name of a file")
     if not path.parent.is_dir():

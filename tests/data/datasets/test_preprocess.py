@@ -265,7 +265,6 @@ def test_wrong_options_are_one_line(tmp_path):
         (command(shard="3/3"), "--shard 3/3"),
         (command(shard="x"), "--shard x"),
         (command(ScanViews(factors=(2.0, 1.0))), "--factors 2 1"),
-        (command(ScanViews(views=0)), "--views 0"),
         (command(body="none.npz"), "--body"),
         (command(), "model: no such folder"),
     ):
