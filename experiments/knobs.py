@@ -28,7 +28,7 @@ PRESETS_HEAD = """
 
 `hg.PRESETS`, `--preset` of `reconstruct`, `animate`, `render`, `demo`; measured in [tradeoff.md](tradeoff.md).
 
-| preset | settings | `Runtime.preset` |
+| preset | settings | `Settings.runtime` |
 |---|---|---|
 """
 

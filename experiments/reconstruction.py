@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,12 +31,11 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.network.bilinear import sample_bilinear, texel_indices
 from humangs_jax.network.config import HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import apply_humangs, decode, encode, needed_tokens, part_variables, read
-from humangs_jax.network.pixel_aligned import COUNT_EPSILON, sum_over_views
+from humangs_jax.network.maps import Convolution, sample_bilinear, texel_indices
 from humangs_jax.network.presets import PRESETS
-from humangs_jax.network.reader import needed_reads, project_and_test, view_weights
+from humangs_jax.network.reader import COUNT_EPSILON, project_and_test, sum_over_views
 from humangs_jax.network.weights import expected_variables, load_weights
 from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
 from humangs_jax.rendering.splatting import render, round_up
@@ -148,16 +148,17 @@ def whole_network_flops(variables: Any, inputs: Any, config: Any) -> int:
 
 def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
     """The package's, with its last convolution evaluated at every pixel and then sampled."""
-    run, reader = config.run(), paper_parts(config.architecture)[1]
+    grid, reader = config.conventions.pixel_grid, paper_parts(config.architecture)[1]
     encoding = encode(variables, inputs, config)
     features = read(variables, encoding, inputs, config)
     if reader.output_width is not None:
-        convolution = reader.output(encoding.maps.shape[-1], run)
-        maps: Any = convolution.apply(part_variables(variables, "reader"), encoding.maps, method="everywhere")
-        pixels, visible = project_and_test(inputs, run)
-        weights = view_weights(visible, inputs, run).astype(pixels.dtype)
+        convolution = Convolution(reader.output_width, nn.initializers.zeros, config.runtime.compute_dtype)
+        maps: Any = convolution.apply(part_variables(variables, "reader"), encoding.maps)
+        pixels, visible = project_and_test(inputs, grid)
+        pooled = visible if config.conventions.pool == "visible" else inputs.present[:, None]
+        weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (inputs.cameras.width, inputs.cameras.height)
-        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), config.conventions.pixel_grid)
+        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), grid)
         sums = sum_over_views(sample_bilinear, maps, indices, weights)
         features = replace(features, local=sums / (jnp.sum(weights, axis=0) + COUNT_EPSILON)[:, None])
     return decode(variables, features, inputs, config).gaussians
@@ -342,17 +343,12 @@ def reconstruction_savings(
     config = config.with_runtime(tokens="all")
     variables = variables or random_variables(config)
     inputs = benchmark_inputs(config, views, size)
-    capacity = int(jax.jit(lambda x: needed_reads(x, config.run()))(inputs))
-    seeing = lambda c: c.with_runtime(vertex_capacity=capacity)
     packed, touched, share = foreground(inputs, config)
     here = lambda config: lambda v, x: apply_humangs(v, x, config)[0].gaussians
     networks = {"as published": lambda v, x: everywhere(v, x, config)}
     if paper_parts(config.architecture)[1].output_width is not None:
         networks["last convolution where read"] = here(config)
-    visible = config.conventions.pool == "visible"
-    if visible:
-        networks["only views that see the vertex"] = here(seeing(config))
-    networks["foreground tokens"] = here(seeing(packed) if visible else packed)
+    networks["foreground tokens"] = here(packed)
     programs = {name: compiled(function, variables, inputs) for name, function in networks.items()}
     outputs = {name: program(variables, inputs) for name, (program, _, _) in programs.items()}
     runs = {name: lambda p=p: jax.block_until_ready(p(variables, inputs)) for name, (p, _, _) in programs.items()}
@@ -375,9 +371,9 @@ def reconstruction_savings(
     vertices = len(inputs.canonical_vertices)
     about = (
         f"{weights.name if weights else 'random'} weights, {preset}, {views} views of {size}, pool {config.conventions.pool}, "
-        f"foreground share {share:.3f}, at most {capacity} of {vertices} vertices seen by a view"
+        f"foreground share {share:.3f}, {vertices} vertices"
     )
-    numbers = {"rows": rows, "foreground_share": share, "foreground_tokens": touched, "vertices_read": capacity}
+    numbers = {"rows": rows, "foreground_share": share, "foreground_tokens": touched}
     run.show(f"{about}\n\n{markdown_table(header, table)}", numbers)
 
 
@@ -403,7 +399,7 @@ def reconstruction_scaling(
     full = configured("paper", size)
     encoder = paper_parts(full.architecture)[0]
     transformer = dataclasses.replace(encoder.transformer, width=WIDTH, layers=LAYERS)
-    half = full.with_parts(encoder=dataclasses.replace(encoder, transformer=transformer))
+    half = full.with_parts(encoder=encoder.clone(transformer=transformer))
     variables, rows = random_variables(half), []
     for count in views:
         inputs, programs = benchmark_inputs(full, count, size), {}

@@ -47,15 +47,14 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
+from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import apply_humangs, init_humangs
-from humangs_jax.network.stages import Recorder
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.seeds import seeds_of
 from humangs_jax.training.config import LossConfig, TrainConfig
-from humangs_jax.training.diagnose import observe_subject
+from humangs_jax.training.diagnose import Recorder, observe_subject
 from humangs_jax.training.forward import draw_targets, white_backgrounds
-from humangs_jax.training.step import NO_NETWORKS
 
 # Extremes ------------------------------------------------------------------------------------------------------------
 
@@ -394,7 +393,7 @@ def observe(case, name):
                 run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32")
             )
             _, found = observe_subject(*learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS)
-            stages = {x.name: {"values": x.values, "cotangents": x.cotangents, "gradients": x.gradients} for x in found}
+            stages = {x.name: {"values": x.values, "cotangents": x.taken, "gradients": x.gradients} for x in found}
         return jax.tree.map(lambda x: np.asarray(x, np.float64), jax.device_get(stages))
 
 
@@ -405,11 +404,10 @@ def observer(model, run):
     def forward(params, batch_stats, body, example):
         recorder = Recorder()
         variables = {"params": params, "batch_stats": batch_stats}
-        with nn.intercept_methods(recorder.watch):
-            prepared = prepare_inputs(body, example.inputs, model)
-            outputs, _ = apply_humangs(variables, prepared, model, True, None, recorder)
+        with nn.intercept_methods(recorder):
+            outputs, _ = apply_humangs(variables, prepare_inputs(body, example.inputs, model), model, True)
             backgrounds = white_backgrounds(example.targets)
-            draw_targets(outputs, body, example.inputs, example.targets, backgrounds, run, recorder)
+            draw_targets(variables, outputs, body, example.inputs, example.targets, backgrounds, run)
         return recorder.given
 
     return jax.jit(forward)

@@ -28,7 +28,7 @@ from humangs_jax.losses.perceptual import BACKBONES, VGG19, Convolution, Lpips, 
 from humangs_jax.people.writer import Layout, write_person
 from humangs_jax.training.config import PRESETS
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import jitted_train_step
+from humangs_jax.training.step import seed_numbers, update
 
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
@@ -162,21 +162,17 @@ class Case:
 
     def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Any]:
         """(the step as a program, CPU seconds that it took to trace and compile, its `Costs`)."""
-        step = jax.jit(
-            jitted_train_step().__wrapped__,
-            static_argnames=("config", "mesh"),
-            donate_argnames="state",
-            compiler_options=options,
-        )
+        static = ("config", "mesh")
+        step = jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
         start = time.process_time()
-        arguments = self.state, self.batch, self.body, self.networks
+        arguments = self.state, self.batch, self.body, self.networks, seed_numbers(self.config.seed)
         traced = step.trace(*arguments, config=self.config, mesh=None)
         program = traced.lower().compile()
         return program, time.process_time() - start, costs_of(traced)
 
     def run(self, program: Any) -> None:
         """One step."""
-        self.state, metrics = program(self.state, self.batch, self.body, self.networks)
+        self.state, metrics = program(self.state, self.batch, self.body, self.networks, seed_numbers(self.config.seed))
         self.metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
 
 

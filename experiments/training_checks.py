@@ -19,20 +19,18 @@ from experiments.training import random_networks, settings, written_subject
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
-from humangs_jax.data.views import SubjectViews, gaussian_body
-from humangs_jax.geometry.camera import Camera
-from humangs_jax.losses.losses import FAR_SURFACE, ray_spread
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.losses.losses import FAR_SURFACE, loss_terms, ray_spread
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.network.parts import HumanGSOutputs
+from humangs_jax.network.parts import Drawn
 from humangs_jax.people.writer import Layout, write_person
-from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.config import LossConfig, TrainConfig
-from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example, white_backgrounds
+from humangs_jax.training.forward import draw_targets, reconstruct_example, white_backgrounds
 from humangs_jax.training.loop import train
 from humangs_jax.training.sources import captured_people
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import loss_terms, subject_loss, train_step
+from humangs_jax.training.step import subject_loss, train_step
 
 PLAIN = "as it is"
 PEOPLE, SIZE, CARRIERS, STEPS, LAST = 3, 64, 1000, 40, 5
@@ -46,7 +44,7 @@ def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS, 
 
     Short runs of the smallest network on three synthetic people, each as `humangs train` makes it, with one thing changed.
     "loss": mean of the last five steps, over the scale of the loss. "PSNR": of the training targets, the same five steps.
-    "gradient": the largest norm before clipping. "clipped", "skipped": steps by the guard of `training.optimizer`. "log": what
+    "gradient": the largest norm before clipping. "clipped", "skipped": steps by the guard of `training.state`. "log": what
     the log reports beside numbers. All parameters, moments and batch statistics have to be finite at the end.
 
     Options:
@@ -321,16 +319,8 @@ def own_case(names: list[str], side: int = SIDE) -> tuple[Any, Any]:
         "tight_offsets": rng.normal(size=(vertices, 1, 3)),
         "shell_spread": uniform(vertices, 3),
     }
-    views = lambda *shape: jnp.zeros((TARGETS, *shape))
-    targets = SubjectViews(
-        images=jnp.asarray(uniform(*pixels, 3)),
-        masks=jnp.asarray(uniform(*pixels)),
-        cameras=jax.vmap(lambda K, pose: Camera(K, pose, side, side))(views(3, 3), views(4, 4)),
-        rotations=views(1, 3),
-        translations=views(3),
-        betas=jnp.zeros(1),
-        depths=jnp.asarray(depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, pixels)),
-    )
+    images, masks = jnp.asarray(uniform(*pixels, 3)), jnp.asarray(uniform(*pixels))
+    depths = jnp.asarray(depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, pixels))
     config = loss_of(names)
     networks = loss_networks(config)
 
@@ -340,11 +330,8 @@ def own_case(names: list[str], side: int = SIDE) -> tuple[Any, Any]:
         one = lambda rgb, alpha, depth: Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32))
         rendering = jax.vmap(one)(point["rgb"], alpha, mean)
         spread = ray_spread(alpha, mean, mean**2 + point["spread"])
-        count = len(point["opacities"])
-        fill = lambda *shape: jnp.zeros((count, *shape), alpha.dtype)
-        gaussians = Gaussians(fill(3), fill(4), fill(3), point["opacities"], fill(3))
-        outputs = HumanGSOutputs(gaussians, point["tight_offsets"], shell_spread=point["shell_spread"])
-        return loss_terms(DrawnTargets(rendering, spread), outputs, targets.images, targets, config, networks)
+        drawn = Drawn(rendering, spread, point["opacities"], point["tight_offsets"], point["shell_spread"])
+        return loss_terms(drawn, images, masks, depths, config, networks)
 
     return values, point
 
@@ -378,11 +365,10 @@ def network_case(names: list[str]) -> tuple[Any, Any]:
 
     @jax.jit
     def depths(point):
-        outputs, _ = reconstruct_example(
-            {"params": point, "batch_stats": batch_stats}, body, example.inputs, config, True
-        )
-        drawn = draw_targets(outputs, body, example.inputs, example.targets, white_backgrounds(example.targets), config)
-        return drawn.rendering.depth
+        variables, targets = {"params": point, "batch_stats": batch_stats}, example.targets
+        outputs, _ = reconstruct_example(variables, body, example.inputs, config, True)
+        given = body, example.inputs, targets, white_backgrounds(targets), config
+        return draw_targets(variables, outputs, *given).rendering.depth
 
     depth = depths(point)
     surface = depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, depth.shape)

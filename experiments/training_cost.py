@@ -20,7 +20,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.training import sharding
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import jitted_train_step
+from humangs_jax.training.step import seed_numbers, update
 
 VARIANTS = {
     "kept": {},
@@ -111,9 +111,10 @@ def step_cost(config: Any, mesh: Any, compile_it: bool) -> dict[str, Any]:
     state = placed(state, sharding.state_shardings(state, mesh))
     batch = placed(batch, jax.tree.map(lambda _: sharding.batch_sharding(mesh), batch))
     # without the compiler options of the CPU that this runs on
-    step = jax.jit(jitted_train_step().__wrapped__, static_argnames=("config", "mesh"), donate_argnames="state")
+    step = jax.jit(update, static_argnames=("config", "mesh"), donate_argnames="state")
     start = time.perf_counter()
-    traced = step.trace(state, batch, everywhere(body), everywhere(networks), config=config, mesh=mesh)
+    given = state, batch, everywhere(body), everywhere(networks), seed_numbers(config.seed)
+    traced = step.trace(*given, config=config, mesh=mesh)
     costs, size = costs_of(traced), lambda tree: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
     facts = {
         "chips": mesh.size,

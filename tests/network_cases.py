@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.network.parts import HumanGSInputs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 

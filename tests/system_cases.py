@@ -3,8 +3,8 @@
 import dataclasses
 
 from experiments.systems import SYSTEMS
+from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.transformer import TransformerConfig
 
 WIDTH, HEAD = 16, 8

@@ -9,13 +9,13 @@ from system_cases import small_system
 from training_cases import POSES, tube
 
 from experiments.systems import SYSTEMS
+from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.body.model import Texels
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import TriplaneConfig
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.transformer import TransformerConfig
 
 PIXELS, DRIVEN = ("lvsm", "humanram"), ("giga", "animatable", "lca")
@@ -32,7 +32,7 @@ def small(name: str) -> HumanGSConfig:
     if name in PIXELS:
         texture = None if name == "lvsm" else TriplaneConfig(resolution=8, channels=2)
         fusion = None if name == "lvsm" else 8
-        config = config.with_parts(decoder=change(parts.decoder, transformer=BLOCKS, texture=texture, fusion=fusion))
+        config = config.with_parts(driver=change(parts.driver, transformer=BLOCKS, texture=texture, fusion=fusion))
     elif name == "lca":
         config = small_system("lhm_views").with_parts(driver=change(parts.driver, hidden=8, layers=1, joints=2))
     else:

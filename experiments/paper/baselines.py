@@ -22,9 +22,8 @@ from humangs_jax.evaluation.cases import draw_painted_body, find_people, painted
 from humangs_jax.losses.metrics import masked_psnr, psnr
 from humangs_jax.losses.ssim import similarity_map
 from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 from humangs_jax.training.loop import train
-from humangs_jax.training.optimizer import OptimizerConfig
 
 VALIDATED = 8
 COUNTS = (1, PHOTOS)

@@ -19,9 +19,8 @@ from experiments.results import REPOSITORY, write_json
 from experiments.systems import ONE_PHOTO as TAKE_ONE
 from experiments.systems import SYSTEMS
 from experiments.systems.grouped import GroupReader
-from experiments.systems.pixel_queries import QueryDecoder
+from experiments.systems.pixel_queries import QueryDriver
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.targets import show_targets
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.evaluation.cases import Predicted, draw_views
@@ -32,9 +31,8 @@ from humangs_jax.network.config import paper_parts
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 from humangs_jax.training.loop import TrainingInterrupted, train
-from humangs_jax.training.optimizer import OptimizerConfig
 from humangs_jax.training.sources import cached_people
 from humangs_jax.training.validation import validate, validation_examples
 
@@ -131,21 +129,21 @@ def variants(steps: int) -> dict[str, Variant]:
         }
         return TrainConfig(**(settings | fields))
 
-    replace, systems = dataclasses.replace, {name: make("bench") for name, make in SYSTEMS.items()}
+    systems = {name: make("bench") for name, make in SYSTEMS.items()}
     ours, plain = systems["humangs"], systems["back_projection"]
     encoder, reader, decoder = paper_parts(ours.architecture)
     tight = lambda weight: run(ours, loss=LossConfig(tightness=weight))
-    per_vertex = lambda free: run(ours.with_parts(decoder=replace(decoder, tight=1, free=free)))
-    flat = replace(reader, shells=())
+    per_vertex = lambda free: run(ours.with_parts(decoder=decoder.clone(tight=1, free=free)))
+    flat = reader.clone(shells=())
     bare = ours.with_parts(reader=flat)
-    gray = {"reader": replace(flat, sample_rgb=False), "decoder": replace(decoder, residual_color=False)}
-    tokenless = replace(encoder, transformer=replace(encoder.transformer, class_token=False))
+    gray = {"reader": flat.clone(sample_rgb=False), "decoder": decoder.clone(residual_color=False)}
+    tokenless = encoder.clone(transformer=dataclasses.replace(encoder.transformer, class_token=False))
     everywhere = ours.with_conventions(tokens="all").with_runtime(token_capacity=0)
 
     def upsampled(features: Any) -> Any:
         width = encoder.transformer.width
-        raised = replace(encoder, upsampler=UpsamplerConfig(width // 3, features))
-        return run(ours.with_parts(encoder=raised, reader=replace(reader, output_width=width)))
+        raised = encoder.clone(upsampler=UpsamplerConfig(width // 3, features))
+        return run(ours.with_parts(encoder=raised, reader=reader.clone(output_width=width)))
 
     found = {
         "back-projection": Variant(run(plain)),
@@ -158,7 +156,7 @@ def variants(steps: int) -> dict[str, Variant]:
         "humangs, another seed": Variant(run(ours, seed=1), "humangs", NOISE),
         "no photo colors": Variant(run(ours.with_parts(**gray)), "no shells", "photo colors (ours)"),
         "canonical frame": Variant(
-            run(bare.with_parts(decoder=replace(decoder, frame="canonical"))), "no shells", "normal frame (ours)"
+            run(bare.with_parts(decoder=decoder.clone(frame="canonical"))), "no shells", "normal frame (ours)"
         ),
         "all tokens": Variant(run(everywhere), "humangs", "foreground tokens (ours)"),
         "features of the last layer": Variant(upsampled("final")),
@@ -364,7 +362,7 @@ def measured(
         ("animation", [row.scores for row in found.rows if row.frame != 0]),
     ):
         means[task] = mean_scores(rows) if rows and (task == "reconstruction" or animatable(config)) else None
-    per_target = config.architecture.runs_per_target
+    per_target = config.architecture.driver is not None
     means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
     means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
     return means
@@ -373,8 +371,8 @@ def measured(
 def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple[Any, float, float]:
     """What a system shows of a `Case`, as `Predicted`; seconds to model, 0 if it runs for each target, and to draw all views."""
     start = modelled = time.perf_counter()
-    if weights[1].architecture.runs_per_target:
-        images, alpha = show_targets(*weights, case.inputs, case.truth, background)
+    if (driver := weights[1].architecture.driver) is not None:
+        images, alpha = driver.show(*weights, case.inputs, case.truth, background)
         predicted = Predicted(images, alpha, tuple(range(case.truth.view_count)))
     else:
         avatar = jax.block_until_ready(reconstruct(*weights, case.inputs))
@@ -390,8 +388,8 @@ def takes_one(config: Any) -> bool:
 
 def animatable(config: Any) -> bool:
     """Whether a system can show a pose that no photo shows: LVSM knows no body."""
-    decoder = config.architecture.decoder
-    return not (isinstance(decoder, QueryDecoder) and decoder.texture is None)
+    driver = config.architecture.driver
+    return not (isinstance(driver, QueryDriver) and driver.texture is None)
 
 
 def triple(scores: Any) -> str:

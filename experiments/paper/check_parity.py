@@ -23,7 +23,6 @@ tie. Where ours tie to within the bound, the nearer one counts: rounding decides
 """
 
 import argparse
-import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -166,7 +165,7 @@ def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size
                 f"model.vertex_decoder: {tight} tight and {free} free Gaussians in the configuration, but "
                 f"{decoder.gaussians_per_vertex} a vertex in the checkpoint"
             )
-        decoder = dataclasses.replace(decoder, tight=tight, free=free)
+        decoder = decoder.clone(tight=tight, free=free)
     pool = "visible" if release["transformer.project_all_vertices"] is False else "all"
     config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
     return config.with_runtime(dtype="bfloat16" if dtype == "bfloat16" else "float32")
@@ -179,7 +178,7 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
 
     from humangs_jax.core.pytree import replace
     from humangs_jax.geometry.camera import Camera
-    from humangs_jax.network.inputs import HumanGSInputs
+    from humangs_jax.network.parts import HumanGSInputs
 
     own = lambda name: jnp.asarray(arrays[name][index], dtype)
     images = jnp.moveaxis(own("in_image"), 1, -1)
@@ -212,33 +211,28 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
 
     from humangs_jax.geometry import quaternion
     from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.encoder import sample_triplane
-    from humangs_jax.network.humangs import apply_humangs, part_variables
-    from humangs_jax.network.stages import Recorder
+    from humangs_jax.network.encoder import encoder_pixels, sample_triplane
+    from humangs_jax.network.humangs import intermediates, part_variables
+    from humangs_jax.network.maps import Convolution
     from humangs_jax.network.vertex_decoder import corrected_skinning_weights
     from humangs_jax.rendering.gaussians import skin_gaussians
 
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
-    config = config.with_runtime(scan=False, remat="none")
-    encoder, reader, _ = paper_parts(config.architecture)
-    recorder = Recorder()
-    with nn.intercept_methods(recorder.watch):
-        outputs, _ = apply_humangs(variables, inputs, config, stage=recorder)
-    stages = recorder.outputs
-    (encoding, _), features, gaussians = stages["encoding"], stages["vertex features"], outputs.gaussians
-    maps = encoding.maps
+    encoder, reader, decoder = paper_parts(config.architecture)
+    stages = intermediates(variables, inputs, config)
+    features, outputs = stages["reader"], stages["decoder"]
+    gaussians, maps = outputs.gaussians, stages["encoder"].maps
     if (
         encoder.upsampler is not None
     ):  # vertices read the last convolution only where they need it; here it is everywhere
-        convolution = reader.output(maps.shape[-1], config.run())
-        maps = convolution.apply(part_variables(variables, "reader"), maps, method="everywhere")
-    pixels, texture = stages["pixels"], variables["params"]["encoder"]["tokenizer"]["texture"]
+        convolution = Convolution(int(reader.output_width or 0), nn.initializers.zeros, config.runtime.compute_dtype)
+        maps = convolution.apply(part_variables(variables, "reader"), maps)
+    pixels, texture = encoder_pixels(inputs, config.run()), variables["params"]["encoder"]["tokenizer"]["texture"]
+    heads = lambda name: stages[f"decoder.{name}_out"].reshape(len(features.local), decoder.gaussians_per_vertex, -1)
     entering = [features.local]
     if features.global_token is not None:
         entering.append(jnp.broadcast_to(features.global_token, (len(features.local), *features.global_token.shape)))
-    weights = corrected_skinning_weights(
-        skinning_weights, outputs.skinning_offsets, config.architecture.decoder.gaussians_per_vertex
-    )
+    weights = corrected_skinning_weights(skinning_weights, outputs.skinning_offsets, decoder.gaussians_per_vertex)
     transforms = jnp.einsum("gj,jab->gab", weights, joint_transforms)
     posed = skin_gaussians(gaussians, transforms, config.conventions.skinning)
     rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
@@ -246,13 +240,13 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     return {
         "out_ray_d": channels_first(pixels[..., 6:9]),
         "out_pose_feature": channels_first(sample_triplane(texture, pixels[..., 9:])),
-        "mid_tokens": stages["tokens"].reshape(len(inputs.images), -1, stages["tokens"].shape[-1]),
-        "mid_block_0": stages["block 0"],
-        "mid_encoder_out": stages["final norm"],
+        "mid_tokens": stages["encoder.tokenizer"].reshape(len(inputs.images), -1, encoder.transformer.width),
+        "mid_block_0": stages["encoder.transformer.block_0"],
+        "mid_encoder_out": stages["encoder.transformer.norm"],
         "mid_feature_map_stride4": channels_first(maps)[:, :, ::MAP_STRIDE, ::MAP_STRIDE],
         "mid_decoder_input": jnp.concatenate(entering, axis=-1),
-        "mid_raw_geometry": stages["raw heads"].geometry,
-        "mid_raw_appearance": stages["raw heads"].appearance,
+        "mid_raw_geometry": heads("geometry"),
+        "mid_raw_appearance": heads("appearance"),
         "asset_means3D": gaussians.means,
         "asset_rotations": gaussians.quats,
         "asset_scales": gaussians.scales,

@@ -15,15 +15,12 @@ from experiments.paper.bench import ANIMATION, FASTER_MODELLING, OURS
 from experiments.results import REPOSITORY, markdown_table, significant
 from experiments.systems import SYSTEMS, back_projection
 from experiments.systems.cross_attention import CrossAttentionReader
-from experiments.systems.two_stream import TwoStreamReader, TwoStreams
 from experiments.timing import medians
 from humangs_jax.body.library import load_body
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import apply_humangs
-from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Encoding
-from humangs_jax.network.runtime import Runtime
+from humangs_jax.network.parts import Encoding, HumanGSInputs
 from humangs_jax.network.weights import expected_variables
 
 PATCH, READ_OPERATIONS = 8, 8
@@ -162,7 +159,7 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
         canonical_normals=normals,
     )
     maps = rng.standard_normal((views, size // PATCH, size // PATCH, width), np.float32)
-    return inputs, Encoding(jnp.asarray(maps), None, jnp.zeros((), jnp.int32))
+    return inputs, Encoding(jnp.asarray(maps), None, jnp.zeros((), jnp.int32), patch_size=PATCH)
 
 
 def network_flops(name: str, photos: int) -> dict[str, float]:
@@ -182,14 +179,21 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
 
 def joint_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of the attention of an LHM-style system in its published size, with LHM's points and tokens."""
-    reader = SYSTEMS[name]("published").architecture.reader
-    assert isinstance(reader, TwoStreamReader)
-    streams = TwoStreams(reader, Runtime())
+    config = SYSTEMS[name]("published")
+    reader, grid = config.architecture.reader, jnp.zeros((photos, TOKENS, 1))
+    camera = jax.vmap(lambda K, pose: Camera(K, pose, 1, TOKENS))(jnp.zeros((photos, 3, 3)), jnp.zeros((photos, 4, 4)))
+
+    def arguments(points: Any, tokens: Any) -> tuple[Any, ...]:
+        """Photos whose pixels are the tokens."""
+        colors, posed = jnp.zeros((*grid.shape, 3)), jnp.broadcast_to(points, (photos, *points.shape))
+        inputs = HumanGSInputs(colors, camera, posed, points, colors, grid, grid > 0)
+        return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.run()
+
+    forward = lambda v, *given: reader.apply(v, *arguments(*given))
+    tokens = jax.ShapeDtypeStruct((*grid.shape, getattr(reader, "width")), jnp.float32)  # noqa: B009 (of a TwoStreamReader)
     points = jax.ShapeDtypeStruct((POINTS, 3), jnp.float32)
-    tokens = jax.ShapeDtypeStruct((photos * TOKENS, reader.width), jnp.float32)
-    few = jnp.zeros((8, 3)), jnp.zeros((8, reader.width))
-    variables = jax.eval_shape(lambda: streams.init(jax.random.key(0), *few, None))
-    forward = lambda v, p, t: streams.apply(v, p, t, None)
+    make = lambda *given: reader.init(jax.random.key(0), *arguments(*given))
+    variables = jax.eval_shape(make, jax.ShapeDtypeStruct((8, 3), jnp.float32), tokens)
     return {
         "photos": photos,
         "vertices": POINTS,

@@ -14,9 +14,10 @@ from typing import Literal
 from experiments.systems.correction import CorrectionMLP
 from experiments.systems.cross_attention import CrossAttentionReader
 from experiments.systems.grouped import GroupDecoder, GroupReader
-from experiments.systems.pixel_queries import NoReader, QueryDecoder, lvsm_transformer
+from experiments.systems.pixel_queries import NoReader, PhotoDecoder, QueryDriver
 from experiments.systems.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
 from experiments.systems.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
+from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
@@ -24,7 +25,6 @@ from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.parts import Driver, Reader
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.runtime import Runtime
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
@@ -39,10 +39,8 @@ BENCH_TOKENS = 336
 def bench() -> HumanGSConfig:
     """HumanGS at the size of the bench: the preset `small` with half of its width and photos of 128 pixels."""
     encoder, reader, decoder = paper_parts(presets.small().architecture)
-    encoder = dataclasses.replace(
-        encoder, texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER
-    )
-    decoder = dataclasses.replace(decoder, hidden=BENCH_WIDTH)
+    encoder = encoder.clone(texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER)
+    decoder = decoder.clone(hidden=BENCH_WIDTH)
     conventions = dataclasses.replace(
         presets.small().conventions,
         image_size=128,
@@ -61,22 +59,22 @@ def humangs(size: Size = "published") -> HumanGSConfig:
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
     """LVSM-style (`pixel_queries`), decoder-only, 24 layers. Novel views only: it cannot be animated."""
-    encoder, conventions = PlainPhotos(patch_size=8), Conventions(image_size=256)
+    parts, conventions = (PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()), Conventions(image_size=256)
     if size == "published":
-        return HumanGSConfig(Architecture(encoder, NoReader(), QueryDecoder()), conventions, Runtime(dtype="bfloat16"))
+        return HumanGSConfig(Architecture(*parts, QueryDriver()), conventions, Runtime(dtype="bfloat16"))
     blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
     conventions = dataclasses.replace(bench().conventions, tokens="all", pixels="all")
-    return HumanGSConfig(Architecture(encoder, NoReader(), QueryDecoder(blocks)), conventions)
+    return HumanGSConfig(Architecture(*parts, QueryDriver(blocks)), conventions)
 
 
 def humanram(size: Size = "published") -> HumanGSConfig:
     """HumanRAM-style (`pixel_queries`): LVSM of 12 layers with the neural texture, and a convolutional decoder, at 512 pixels."""
     config = lvsm(size)
     if size == "published":
-        decoder = QueryDecoder(lvsm_transformer(12), TriplaneConfig(), fusion=256)
-        return config.with_parts(decoder=decoder).with_conventions(image_size=512)
+        driver = QueryDriver(TransformerConfig(layers=12, class_token=False), TriplaneConfig(), fusion=256)
+        return config.with_parts(driver=driver).with_conventions(image_size=512)
     blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
-    return config.with_parts(decoder=QueryDecoder(blocks, TriplaneConfig(resolution=32, channels=8), fusion=32))
+    return config.with_parts(driver=QueryDriver(blocks, TriplaneConfig(resolution=32, channels=8), fusion=32))
 
 
 def giga(size: Size = "published") -> HumanGSConfig:
@@ -116,8 +114,8 @@ def back_projection(size: Size = "published") -> HumanGSConfig:
     """
     config = humangs(size)
     encoder, _, decoder = paper_parts(config.architecture)
-    encoder = dataclasses.replace(encoder, upsampler=None)
-    decoder = dataclasses.replace(decoder, frame="canonical", residual_color=False)
+    encoder = encoder.clone(upsampler=None)
+    decoder = decoder.clone(frame="canonical", residual_color=False)
     return config.with_parts(encoder=encoder, reader=PixelAlignedReader(output_width=None), decoder=decoder)
 
 
@@ -136,7 +134,7 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
         reader, decoder = (
-            TwoStreamReader(pooling=pooling, most_views=most_views, patch_size=16),
+            TwoStreamReader(pooling=pooling, most_views=most_views),
             VertexDecoder(hidden=512),
         )
         conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.01)
@@ -144,7 +142,7 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
         encoder = _photo_encoder(dataclasses.replace(BENCH_TRANSFORMER, class_token=False))
         reader = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views)
         decoder, conventions = VertexDecoder(hidden=BENCH_WIDTH), bench().conventions
-    decoder = dataclasses.replace(decoder, tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
+    decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
     runtime = Runtime() if size == "published" else bench().runtime
     return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, runtime)
 
@@ -168,7 +166,7 @@ def gst(size: Size = "published") -> HumanGSConfig:
             TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16
         )
         conventions = Conventions(image_size=256, body_vertices=6890)  # those of SMPL
-        return HumanGSConfig(Architecture(encoder, GroupReader(patch_size=16), GroupDecoder()), conventions)
+        return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder()), conventions)
     config = lhm("bench")
     reader = GroupReader(26, BENCH_WIDTH, 2, 2, BENCH_HEAD)
     return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=128))

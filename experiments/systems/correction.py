@@ -6,20 +6,20 @@ skinning. Our reading of the second MLP: it takes the features of a vertex, whic
 rotations of all joints but the root.
 """
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from experiments.systems.targets import GaussianDriver
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import Few, Layers, Spread, Width, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables, VertexFeatures
+from humangs_jax.network.parts import HumanGSOutputs, Pass, Target, VertexFeatures
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -69,55 +69,38 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
 
 
 @part
-class CorrectionMLP:
+class CorrectionMLP(GaussianDriver):
     """The LCA-style driver, for readers that give `VertexFeatures`, and a decoder with K Gaussians per vertex.
 
-    hidden: width. layers: hidden ones. joints: of the body. offset_scale: metres, bound of the offsets. gaussians_per_vertex: K.
+    Inputs of vertices -> raw corrections, 14 for each Gaussian; they start near 0.
     """
 
     hidden: Width = 512
     layers: Layers = 3
+    """Hidden ones."""
     joints: Few = 55
+    """Of the body."""
     offset_scale: Spread = 0.05
+    """Metres, bound of the offsets."""
     gaussians_per_vertex: Few = 1
+    """K."""
 
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the MLP. Raises: ValueError for other features."""
-        if not isinstance(features, VertexFeatures):
-            raise ValueError(f"a CorrectionMLP needs VertexFeatures, got {type(features).__name__}")
-        entering = features.local.shape[-1] + 3 * (self.joints - 1)
-        return cast(Variables, self._module().init(key, jnp.zeros((1, entering))))
-
-    def apply(
-        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
-    ) -> HumanGSOutputs:
-        """See `parts.Driver`. Raises: ValueError for another K; see `pose_vector`."""
-        local = outputs.scene.local
-        per_vertex = self.gaussians_per_vertex
+    @nn.compact
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
+        """See `parts.Driver`. Raises: ValueError for other features or another K; see `pose_vector`."""
+        if not isinstance(outputs.scene, VertexFeatures):
+            raise ValueError(f"a CorrectionMLP needs VertexFeatures, got {type(outputs.scene).__name__}")
+        local, per_vertex = outputs.scene.local, self.gaussians_per_vertex
         if len(outputs.gaussians.opacities) != per_vertex * len(local):
             raise ValueError(f"driver.gaussians_per_vertex {per_vertex}: the decoder gives another number")
-        vector = jnp.broadcast_to(pose_vector(pose, self.joints), (len(local), 3 * (self.joints - 1)))
-        raw = self._module().apply(variables, jnp.concatenate([local, vector], axis=-1))
+        vector = jnp.broadcast_to(pose_vector(target.pose, self.joints), (len(local), 3 * (self.joints - 1)))
+        x = jnp.concatenate([local, vector], axis=-1)
+        for i in range(self.layers):
+            x = jax.nn.silu(nn.Dense(self.hidden, name=f"hidden_{i}")(x))
+        last = nn.initializers.normal(LAST_STD)
+        raw = nn.Dense(CHANNELS * per_vertex, kernel_init=last, name="out")(x)
         gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale)
         driven = offsets.reshape(len(local), per_vertex, 3)  # of a body of 1.8 m, metres are normalised units
         if outputs.tight_offsets is not None:  # the canonical ones stay small, too
             driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
         return replace(outputs, gaussians=gaussians, tight_offsets=driven)
-
-    def _module(self):
-        return CorrectionModule(self.hidden, self.layers, self.gaussians_per_vertex)
-
-
-class CorrectionModule(nn.Module):
-    """Inputs of vertices (n, c) -> raw corrections (n, m = 14 k); they start near 0."""
-
-    hidden: int
-    layers: int
-    per_vertex: int
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "n c"]) -> Float[Array, "n m"]:
-        for i in range(self.layers):
-            x = jax.nn.silu(nn.Dense(self.hidden, name=f"hidden_{i}")(x))
-        last = nn.initializers.normal(LAST_STD)
-        return nn.Dense(CHANNELS * self.per_vertex, kernel_init=last, name="out")(x)

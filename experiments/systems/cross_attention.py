@@ -8,17 +8,13 @@ vertices times views. One layer is
 where x begins as the encoded canonical position of a vertex.
 """
 
-from typing import cast
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Layers, Patch, Ratio, Width, part
-from humangs_jax.network.encoder import pack_patches, touched_patches
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import Layers, Ratio, Width, part
+from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, VertexFeatures, subject_unit
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import INIT_STD, NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
@@ -27,54 +23,47 @@ INIT = nn.initializers.normal(INIT_STD)
 
 
 @part
-class CrossAttentionReader:
-    """Vertices as queries, image tokens as keys and values. width: features of a vertex. layers, mlp_ratio, head_width: as in
-    `TransformerConfig`. patch_size: of the encoder whose tokens are looked at.
-    """
+class CrossAttentionReader(Reader):
+    """Vertices as queries, image tokens as keys and values."""
 
     width: Width = 768
+    """Features of a vertex."""
     layers: Layers = 1
     mlp_ratio: Ratio = 4
     head_width: Width = 64
-    patch_size: Patch = 8
+    """As `layers` and `mlp_ratio`: see `TransformerConfig`."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
+        super().__post_init__()
         check_heads("reader", self.width, self.head_width)
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the layers."""
-        tokens = jnp.zeros((1, encoding.maps.shape[-1]))
-        return cast(Variables, self._module(run).init(key, jnp.zeros((1, 3)), tokens, None))
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    @nn.compact
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for an encoder with an upsampler."""
+        tokens, count = image_tokens(encoding, inputs)
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
-        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run, self.patch_size))
-        return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
+        x = nn.Dense(self.width, kernel_init=INIT, name="position")(positional_encoding(canonical))
+        for index in range(self.layers):
+            x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(x, tokens, count)
+        local = layer_norm(None, "norm", use_bias=True)(x)
+        return VertexFeatures(local, encoding.global_token, normals=inputs.canonical_normals)
 
-    def _module(self, run: Pass):
-        return VertexQueries(self, run.runtime)
 
-
-def image_tokens(
-    encoding: Encoding, inputs: HumanGSInputs, run: Pass, patch: int
-) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
+def image_tokens(encoding: Encoding, inputs: HumanGSInputs) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
     """The tokens of all views, those of padding last, and the number of real ones (None: all).
 
     Raises: ValueError unless the maps have one element a patch.
     """
-    height, width, features = encoding.maps.shape[1:]
+    _, height, width, features = encoding.maps.shape
+    tokens, packing = encoding.maps.reshape(-1, features), encoding.packing
+    patch = encoding.patch_size
     if inputs.images.shape[1:3] != (height * patch, width * patch):
         raise ValueError(
             f"attention to tokens needs maps of one element per {patch} x {patch} patch, got {width} x {height} for photos of "
             f"{inputs.images.shape[2]} x {inputs.images.shape[1]}: encoder.upsampler must be None"
         )
-    tokens = encoding.maps.reshape(-1, features)
-    if run.tokens == "foreground":
-        packing = pack_patches(
-            touched_patches(inputs, patch), min(run.runtime.token_capacity or len(tokens), len(tokens))
-        )
+    if packing is not None:
         return tokens.at[packing.indices].get(mode="fill", fill_value=0), packing.count
     return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)
 
@@ -83,24 +72,6 @@ def check_heads(part: str, width: int, head_width: int) -> None:
     """Raises ValueError unless heads of that width fill the features."""
     if width % head_width:
         raise ValueError(f"{part}: width {width} is not a multiple of head_width {head_width}")
-
-
-class VertexQueries(nn.Module):
-    """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
-
-    config: CrossAttentionReader
-    runtime: Runtime
-
-    @nn.compact
-    def __call__(
-        self, positions: Float[Array, "n 3"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
-    ) -> Float[Array, "n d"]:
-        x = nn.Dense(self.config.width, kernel_init=INIT, name="position")(positional_encoding(positions))
-        for index in range(self.config.layers):
-            x = CrossBlock(self.config.head_width, self.config.mlp_ratio, self.runtime, name=f"block_{index}")(
-                x, tokens, count
-            )
-        return layer_norm(None, "norm", use_bias=True)(x)
 
 
 class CrossBlock(nn.Module):
@@ -121,7 +92,7 @@ class CrossBlock(nn.Module):
         q = rms(heads(dense(width, "q")(layer_norm(dtype, "norm1")(x))), "q_norm")
         k, v = jnp.split(dense(2 * width, "kv")(tokens), 2, axis=-1)
         k = rms(heads(k), "k_norm")
-        seen = attention(q, k, heads(v), count, self.runtime.attention, self.runtime.attention_chunk)
+        seen = attention(q, k, heads(v), count, self.runtime.attention)
         x = x + dense(width, "out")(seen.reshape(len(x), width))
         hidden = dense(self.mlp_ratio * width, "mlp_in")(layer_norm(dtype, "norm2")(x))
         return x + dense(width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))

@@ -16,36 +16,31 @@ four depths, from the last to the first, each followed by a residual block, and 
 pixels.
 """
 
-import dataclasses
 from typing import Annotated, Any, NamedTuple, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Int, Key
+from experiments.systems.targets import PixelDriver
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.configuration import Patch, Range, part
-from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.encoder import TEXTURE_STD, TriplaneConfig, encoder_pixels, patchify, sample_triplane
-from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables, scene_outputs
-from humangs_jax.network.runtime import Runtime
+from humangs_jax.network.maps import Convolution
+from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, Target
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import KAIMING, SLOPE, UpConvolution
+from humangs_jax.rendering.gaussians import Gaussians
 
 LEAST_WIDTH = 8
 """Of the maps of the convolutional decoder, whose width halves as their sides double."""
 
 
 @part
-class NoReader:
+class NoReader(Reader):
     """The reader of systems whose decoders read the inputs themselves: its features are the encoding."""
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{}: nothing is learned."""
-        return {}
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Encoding:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Encoding:
         """The encoding."""
         return encoding
 
@@ -58,79 +53,48 @@ class Photos(NamedTuple):
 
 
 @part
-class QueryDecoder:
-    """A `PixelDecoder`. transformer: without a class token. texture: the neural texture (HumanRAM), None: the body is unknown
-    (LVSM). fusion: width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map.
-    patch_size: of photos and targets.
-    """
+class PhotoDecoder(Decoder):
+    """No Gaussians: the photos, for a `QueryDriver`."""
 
-    transformer: TransformerConfig = dataclasses.field(default_factory=lambda: lvsm_transformer(24))
+    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+        """See `parts.Decoder`."""
+        nothing = Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
+        return HumanGSOutputs(nothing, scene=Photos(encoder_pixels(inputs, run), inputs.view_count))
+
+
+@part
+class QueryDriver(PixelDriver):
+    """The pixels of a target from the photos."""
+
+    transformer: TransformerConfig = TransformerConfig(layers=24, class_token=False)
+    """Without a class token."""
     texture: TriplaneConfig | None = None
+    """The neural texture (HumanRAM), None: the body is unknown (LVSM)."""
     fusion: Annotated[int, Range(2, 16_384)] | None = None
+    """Width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map."""
     patch_size: Patch = 8
+    """Of photos and targets."""
 
     def __post_init__(self):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""
+        super().__post_init__()
         if self.transformer.class_token:
-            raise ValueError("decoder.transformer.class_token: expected false, there is no global token here")
+            raise ValueError("driver.transformer.class_token: expected false, there is no global token here")
         if self.fusion is not None and self.transformer.layers < 4:
-            raise ValueError(f"decoder.fusion needs at least 4 layers, got {self.transformer.layers}")
-
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of `QueryModule`."""
-        photos = jnp.zeros((*inputs.images.shape[:-1], 12))
-        return cast(Variables, self._module(run).init(key, photos, photos[0, ..., :9]))
-
-    def apply(self, variables: Variables, features: Any, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        """No Gaussians; what `draw` needs of the photos."""
-        pixels = run.stage("pixels", lambda: encoder_pixels(inputs, run))
-        return scene_outputs(Photos(pixels, inputs.view_count))
-
-    def draw(
-        self, variables: Variables, scene: Photos, queries: Float[Array, "v h w 9"], run: Pass
-    ) -> Float[Array, "v h w 3"]:
-        """Images of the targets, a pass each."""
-
-        @jax.checkpoint
-        def one(query):
-            return self._module(run).apply(variables, scene.pixels, query, scene.view_count)
-
-        return jax.lax.map(one, queries)
-
-    def _module(self, run):
-        return QueryModule(self, self.patch_size, run.runtime)
-
-
-def lvsm_transformer(layers: int) -> TransformerConfig:
-    """LVSM's blocks: width 768, heads of 64 with normalised queries and keys."""
-    return TransformerConfig(width=768, layers=layers, class_token=False)
-
-
-class QueryModule(nn.Module):
-    """Photos (v, h, w, 12: rgb, ray, position) and pixels of one target (i, j, 9: ray, position) -> its colors (i, j, 3)."""
-
-    config: QueryDecoder
-    patch: int
-    runtime: Runtime
+            raise ValueError(f"driver.fusion needs at least 4 layers, got {self.transformer.layers}")
 
     @nn.compact
-    def __call__(
-        self,
-        photos: Float[Array, "v h w 12"],
-        query: Float[Array, "i j 9"],
-        view_count: Int[Array, ""] | None = None,
-    ) -> Float[Array, "i j 3"]:
-        config, patch, dtype = self.config, self.patch, self.runtime.compute_dtype
-        width, rays = config.transformer.width, (photos[..., 3:9], query[..., :6])
-        seen, asked = rays
-        if config.texture is not None:
-            shape = (3, config.texture.resolution, config.texture.resolution, config.texture.channels)
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> Float[Array, "i j 3"]:
+        """The image of a target in [0, 1], on white; its sides are multiples of the patch size."""
+        photos: Photos = outputs.scene
+        patch, dtype, width = self.patch_size, run.runtime.compute_dtype, self.transformer.width
+        query = cast(Array, target.pixels)
+        seen, asked = photos.pixels[..., 3:9], query[..., :6]
+        if self.texture is not None:
+            shape = (3, self.texture.resolution, self.texture.resolution, self.texture.channels)
             texture = self.param("texture", nn.initializers.normal(TEXTURE_STD), shape)
-            positions = (photos[..., 9:], query[..., 6:])
-            seen, asked = (
-                jnp.concatenate([ray, sample_triplane(texture, at)], axis=-1)
-                for ray, at in zip(rays, positions, strict=True)
-            )
+            features = lambda ray, at: jnp.concatenate([ray, sample_triplane(texture, at)], axis=-1)
+            seen, asked = features(seen, photos.pixels[..., 9:]), features(asked, query[..., 6:])
 
         def linear(features, name):
             init = nn.initializers.normal(INIT_STD)
@@ -140,18 +104,18 @@ class QueryModule(nn.Module):
             patches = patchify(maps, patch)
             return linear(width, name)(patches.reshape(len(patches), -1))
 
-        seen = tokens_of(jnp.concatenate([2 * photos[..., :3] - 1, seen], axis=-1), "photo_tokens")
+        seen = tokens_of(jnp.concatenate([2 * photos.pixels[..., :3] - 1, seen], axis=-1), "photo_tokens")
         asked = tokens_of(asked[None], "target_tokens")
         targets = len(asked)
         # the target comes first: photos that are padding are the last tokens
-        count = None if view_count is None else targets + view_count * (len(seen) // len(photos))
-        depths = Transformer(config.transformer, self.runtime, name="transformer")(
-            jnp.concatenate([asked, seen]), count
-        )
+        real = photos.view_count
+        count = None if real is None else targets + real * (len(seen) // len(photos.pixels))
+        transformer = Transformer(self.transformer, run.runtime, name="transformer")
+        depths = transformer(jnp.concatenate([asked, seen]), count)
         rows, columns = query.shape[0] // patch, query.shape[1] // patch
         maps = [x[:targets].reshape(1, rows, columns, width) for x in depths]
-        if config.fusion is not None:
-            return jax.nn.sigmoid(FusionHead(config.fusion, patch, dtype, name="fusion")(maps)[0])
+        if self.fusion is not None:
+            return jax.nn.sigmoid(FusionHead(self.fusion, patch, dtype, name="fusion")(maps)[0])
         pixels = linear(3 * patch**2, "rgb")(maps[-1]).reshape(rows, columns, patch, patch, 3)
         return jax.nn.sigmoid(jnp.swapaxes(pixels, 1, 2).reshape(*query.shape[:2], 3))
 
@@ -166,7 +130,7 @@ class FusionHead(nn.Module):
     @nn.compact
     def __call__(self, maps: list[Float[Array, "v h w d"]]) -> Float[Array, "v i j 3"]:
         if self.patch & (self.patch - 1):
-            raise ValueError(f"decoder.fusion: patch_size {self.patch}: expected a power of 2")
+            raise ValueError(f"driver.fusion: patch_size {self.patch}: expected a power of 2")
         activate = lambda x: jax.nn.leaky_relu(x, SLOPE)
         convolution = lambda features, name: Convolution(features, KAIMING, self.dtype, name=name)
 

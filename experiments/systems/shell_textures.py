@@ -11,23 +11,29 @@ shells that no photo shows on the person are transparent. Theirs is of one pose;
 points, so that the person can be animated. The encoder is `PlainPhotos`: none.
 """
 
-import dataclasses
-from typing import cast
-
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.unet import UNet, check_scales, doubled, halved
-from humangs_jax.core.array_types import Array, Bool, Float, Key
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.configuration import Patch, Spread, Width, part
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.bilinear import sample_bilinear, sample_nearest, texel_indices
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
-from humangs_jax.network.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
-from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.maps import sample_bilinear, sample_nearest, texel_indices
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    subject_unit,
+)
+from humangs_jax.network.reader import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -50,37 +56,31 @@ class ShellTextures:
 
 
 @part
-class PlainPhotos:
+class PlainPhotos(Encoder):
     """The encoder of systems that read the photos themselves: its maps are their colors."""
 
     patch_size: Patch = 1
 
-    def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{}: nothing is learned."""
-        return {}
-
-    def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
+    def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
         """See `parts.Encoder`."""
-        return Encoding(inputs.images, None, jnp.zeros((), jnp.int32)), {}
+        return Encoding(inputs.images, None, jnp.zeros((), jnp.int32))
 
 
 @part
-class ShellTextureReader:
-    """The textures. shells: ascending distances from the surface, normalised units, the first 0."""
+class ShellTextureReader(Reader):
+    """The textures."""
 
-    surface_map: SurfaceMap = dataclasses.field(default_factory=lambda: SurfaceMap("atlas", 1024))
+    surface_map: SurfaceMap = SurfaceMap("atlas", 1024)
     shells: tuple[Spread, ...] = DISTANCES
+    """Ascending distances from the surface, normalised units, the first 0."""
 
     def __post_init__(self):
         """Raises ValueError unless the shells begin at the surface and ascend."""
+        super().__post_init__()
         if not self.shells or self.shells[0] != 0 or list(self.shells) != sorted(set(self.shells)):
             raise ValueError(f"reader.shells {self.shells}: expected ascending distances, the first 0")
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{}: nothing is learned."""
-        return {}
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
         """Textures of the shells. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
         if inputs.texels is None or inputs.posed_normals is None:
             raise ValueError("shell textures need texels and posed_normals of the inputs, see `prepare_inputs`")
@@ -143,23 +143,21 @@ def _filled(sums, weights):
 
 
 @part
-class ShellDecoder:
-    """The U-Net. widths: its features, the finest scale first. largest_scale: of a Gaussian, normalised units."""
+class ShellDecoder(Decoder):
+    """The U-Net."""
 
     widths: tuple[Width, ...] = (32, 48, 96)
+    """Its features, the finest scale first."""
     largest_scale: Spread = 0.01
+    """Of a Gaussian, normalised units."""
 
     def __post_init__(self):
         """Raises ValueError for widths that no U-Net has."""
+        super().__post_init__()
         check_scales("decoder.widths", self.widths)
 
-    def init(self, key: Key, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the U-Net."""
-        side = 2 ** (len(self.widths) - 1)
-        channels = 3 * (2 * len(features.distances) - 1)
-        return cast(Variables, self._network(features).init(key, jnp.zeros((1, side, side, channels))))
-
-    def apply(self, variables: Variables, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    @nn.compact
+    def __call__(self, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """A Gaussian a texel of every shell; those that show no point of the body, or were not seen, are transparent.
 
         Raises: ValueError if the inputs lack the map of the surface, normals or skinning weights.
@@ -171,30 +169,21 @@ class ShellDecoder:
         covered = texels.covered
         surface = texels.interpolate(inputs.canonical_vertices / unit)
         offsets = features.distances[:, None, None, None] * safe_normalize(texels.interpolate(normals), jnp.zeros(3))
-
-        def heads(colors):
-            channels = jnp.concatenate([2 * colors - 1, offsets[1:]])
-            entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
-            raw = cast(Array, self._network(features).apply(variables, entering))[0]
-            return jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
-
-        def assemble(raw):
-            quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
-            shown = covered & features.seen.at[0].set(True)
-            flat = lambda x: x.reshape(-1, x.shape[-1])
-            return Gaussians(
-                means=flat(surface + offsets) * unit,
-                quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
-                scales=flat(self.largest_scale * jax.nn.sigmoid(scales)) * unit,
-                opacities=jnp.where(shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0).reshape(-1),
-                colors=flat(features.colors),
-            )
-
-        raw = run.stage("raw heads", heads, features.colors)
-        gaussians = run.stage("canonical Gaussians", assemble, raw)
+        channels = jnp.concatenate([2 * features.colors - 1, offsets[1:]])
+        entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
+        nn.share_scope(self, network := UNet(self.widths, sum(CHANNELS) * shells))
+        raw = network(entering)[0]
+        raw = jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
+        quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
+        shown = covered & features.seen.at[0].set(True)
+        flat = lambda x: x.reshape(-1, x.shape[-1])
+        gaussians = Gaussians(
+            means=flat(surface + offsets) * unit,
+            quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
+            scales=flat(self.largest_scale * jax.nn.sigmoid(scales)) * unit,
+            opacities=jnp.where(shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0).reshape(-1),
+            colors=flat(features.colors),
+        )
         rows = texels.interpolate(weights).at[..., 0].add(1.0 - covered)  # what shows nothing stays at the root
         rows = jnp.tile(rows.reshape(-1, rows.shape[-1]), (shells, 1))
         return HumanGSOutputs(gaussians, skinning_weights=rows)
-
-    def _network(self, features: ShellTextures):
-        return UNet(self.widths, sum(CHANNELS) * len(features.distances))

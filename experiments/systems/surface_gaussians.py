@@ -19,27 +19,33 @@ Both start from the same Gaussians, flat ones on the surface: with zero correcti
 are transparent.
 """
 
-import dataclasses
-from typing import Any, cast
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from experiments.systems.correction import CHANNELS, apply_corrections, pose_vector
+from experiments.systems.surface_map import SurfaceMap
+from experiments.systems.targets import GaussianDriver
 from experiments.systems.unet import UNet, check_scales
-from humangs_jax.body.model import BodyPose, Texels
-from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.body.model import Texels
+from humangs_jax.core.array_types import Array, Float, PyTree
 from humangs_jax.core.configuration import Few, Spread, Weight, Width, part
 from humangs_jax.core.numerics import safe_divide, safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.network.bilinear import sample_bilinear, texel_indices
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
-from humangs_jax.network.pixel_aligned import UNSEEN_COLOR, project_vertices, visible_vertices
-from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.maps import sample_bilinear, texel_indices
+from humangs_jax.network.parts import (
+    Decoder,
+    Encoding,
+    HumanGSInputs,
+    HumanGSOutputs,
+    Pass,
+    Reader,
+    Target,
+    subject_unit,
+)
+from humangs_jax.network.reader import UNSEEN_COLOR, project_vertices, visible_vertices
 from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -69,17 +75,14 @@ class Surface:
 
 
 @part
-class TextureReader:
-    """Photos -> the texture of the body. sharpness: of the softmax over the cosines of visible views; larger: the best view."""
+class TextureReader(Reader):
+    """Photos -> the texture of the body."""
 
-    surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
+    surface_map: SurfaceMap = SurfaceMap()
     sharpness: Weight = 5.0
+    """Of the softmax over the cosines of visible views; larger: the best view."""
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{}: nothing is learned."""
-        return {}
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> SurfaceTexture:
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> SurfaceTexture:
         """The texture. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
         texels = _texels(inputs)
         if inputs.posed_normals is None:
@@ -106,19 +109,15 @@ class TextureReader:
 
 
 @part
-class SurfaceDecoder:
+class SurfaceDecoder(Decoder):
     """A flat Gaussian on the surface for every texel, row-major, with the texture's color: what drivers correct.
 
     Nothing is learned. Without a texture, features of any other kind, colors are grey.
     """
 
-    surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
+    surface_map: SurfaceMap = SurfaceMap()
 
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{}: nothing is learned."""
-        return {}
-
-    def apply(self, variables: Variables, features: Any, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """See `parts.Decoder`. Raises: ValueError if the inputs lack the map, the normals or the weights of the body."""
         texels = _texels(inputs)
         if inputs.canonical_normals is None or inputs.skinning_weights is None:
@@ -148,91 +147,66 @@ def _texels(inputs: HumanGSInputs) -> Texels:
 
 
 @part
-class TextureDriver:
-    """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose.
-
-    widths: of the U-Net. pose_width, pose_tokens: of the MLP of the pose. joints: of the body. offset_scale: metres, bound of
-    the offsets.
-    """
+class TextureDriver(GaussianDriver):
+    """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose."""
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
+    """Of the U-Net."""
     pose_width: Width = 1024
+    """Of the MLP of the pose, as `pose_tokens`."""
     pose_tokens: Few = 16
     joints: Few = 55
+    """Of the body."""
     offset_scale: Spread = 0.1
+    """Metres, bound of the offsets."""
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""
+        super().__post_init__()
         check_scales("driver.widths", self.widths)
 
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the U-Net and the MLP in it."""
-        side = 2 ** (len(self.widths) - 1)
-        return cast(
-            Variables, self._module().init(key, jnp.zeros((1, side, side, 7)), jnp.zeros(3 * (self.joints - 1)))
-        )
-
-    def apply(
-        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
-    ) -> HumanGSOutputs:
+    @nn.compact
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
         """See `parts.Driver`. Raises: ValueError for a decoder without a texture; see `correction.pose_vector`."""
         surface: Surface = outputs.scene
         if surface.texture is None:
             raise ValueError("a TextureDriver needs a TextureReader")
-        texture = surface.texture
+        texture, attention = surface.texture, PoseAttention(self.pose_width, self.pose_tokens, parent=None)
         maps = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None], surface.positions], axis=-1)
-        raw = self._module().apply(variables, maps[None], pose_vector(pose, self.joints))
-        return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
-
-    def _module(self):
-        return UNet(self.widths, CHANNELS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
+        nn.share_scope(self, network := UNet(self.widths, CHANNELS, attention))
+        return _driven(outputs, network(maps[None], pose_vector(target.pose, self.joints))[0], self.offset_scale)
 
 
 @part
-class PoseMapDriver:
-    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colors.
-
-    widths: of each U-Net. offset_scale: metres, bound of the offsets.
-    """
+class PoseMapDriver(GaussianDriver):
+    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colors."""
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
+    """Of each U-Net."""
     offset_scale: Spread = 0.05
+    """Metres, bound of the offsets."""
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""
+        super().__post_init__()
         check_scales("driver.widths", self.widths)
 
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the U-Nets."""
-        side = 2 ** (len(self.widths) - 1)
-        return cast(Variables, PoseMapModule(self.widths).init(key, jnp.zeros((1, side, side, 3))))
-
-    def apply(
-        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
-    ) -> HumanGSOutputs:
+    @nn.compact
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
         """See `parts.Driver`."""
         surface: Surface = outputs.scene
-        upright = quaternion.matrix_from_axis_angle(pose.rotations[0])
-        relative = jnp.matmul(posed - jnp.mean(posed, axis=0), upright, precision=EXACT)  # rows times R: R^T p
-        maps = surface.texels.interpolate(relative)
-        raw = PoseMapModule(self.widths).apply(variables, maps[None])
-        return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
+        upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])
+        middle = jnp.mean(target.vertices, axis=0)
+        relative = jnp.matmul(target.vertices - middle, upright, precision=EXACT)  # rows times R: R^T p
+        maps = surface.texels.interpolate(relative)[None]
+        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.CHANNELS`
+        raw = jnp.concatenate([UNet(self.widths, n, name=name)(maps) for name, n in nets.items()], axis=-1)
+        return _driven(outputs, raw[0], self.offset_scale)
 
 
-def _driven(outputs, raw, offset_scale):
+def _driven(outputs: HumanGSOutputs, raw: Float[Array, "h w 14"], offset_scale: float) -> HumanGSOutputs:
     gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), offset_scale)
     return replace(outputs, gaussians=gaussians, tight_offsets=offsets[:, None])
-
-
-class PoseMapModule(nn.Module):
-    """Maps (1, h, w, 3) -> raw corrections (1, h, w, 14)."""
-
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, maps: Float[Array, "v h w 3"]) -> Float[Array, "v h w 14"]:
-        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.CHANNELS`
-        return jnp.concatenate([UNet(self.widths, n, name=name)(maps) for name, n in nets.items()], axis=-1)
 
 
 class PoseAttention(nn.Module):

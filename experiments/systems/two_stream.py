@@ -11,18 +11,15 @@ curve, as Point Transformer V3 does (https://arxiv.org/abs/2312.10035), once and
 are, not as features for a second network. The cost grows with (points + tokens)^2.
 """
 
-from typing import cast
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from experiments.systems.cross_attention import INIT, check_heads, image_tokens
-from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Few, Layers, Patch, Ratio, Vertices, Width, part
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, part
 from humangs_jax.geometry.transform import along_curve
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, VertexFeatures, subject_unit
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
@@ -32,39 +29,47 @@ CURVE_REACH = 1.2
 
 
 @part
-class TwoStreamReader:
-    """Joint attention of points and tokens.
-
-    width, mlp_ratio, head_width: of both streams, as in `TransformerConfig`. blocks: how many. pooling: vertices that share a
-    point; 1: every vertex is one. most_views: more photos than this are refused, None: none are (LHM takes 1).
-    """
+class TwoStreamReader(Reader):
+    """Joint attention of points and tokens."""
 
     width: Width = 1024
+    """Of both streams; `mlp_ratio` and `head_width` as in `TransformerConfig`."""
     blocks: Layers = 5
     mlp_ratio: Ratio = 4
     head_width: Width = 64
     pooling: Vertices = 1
+    """Vertices that share a point; 1: every vertex is one."""
     most_views: Few | None = None
-    patch_size: Patch = 8
+    """More photos than this are refused, None: none are (LHM takes 1)."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
+        super().__post_init__()
         check_heads("reader", self.width, self.head_width)
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of `TwoStreams`."""
-        tokens = jnp.zeros((1, encoding.maps.shape[-1]))
-        return cast(Variables, self._module(run).init(key, jnp.zeros((1, 3)), tokens, None))
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    @nn.compact
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for too many views, or an encoder with an upsampler."""
         check_views(inputs, self.most_views)
-        canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
-        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run, self.patch_size))
-        return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
-
-    def _module(self, run: Pass):
-        return TwoStreams(self, run.runtime)
+        tokens, count = image_tokens(encoding, inputs)
+        positions = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
+        dense = lambda name: nn.Dense(self.width, kernel_init=INIT, name=name)
+        embedded = dense("position_out")(jax.nn.silu(dense("position_in")(positional_encoding(positions))))
+        points, cluster = embedded, None
+        if self.pooling > 1:
+            cluster, clusters = along_curve(positions, CURVE_REACH) // self.pooling, -(-len(positions) // self.pooling)
+            members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
+            points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
+        tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))
+        present = jnp.ones(len(tokens)) if count is None else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
+        pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
+        for index in range(self.blocks):
+            last, sizes = index + 1 == self.blocks, (self.width, self.mlp_ratio, self.head_width)
+            block = TwoStreamBlock(*sizes, run.runtime, last, name=f"block_{index}")
+            points, tokens = block(points, tokens, count, pooled)
+        points = layer_norm(None, "norm", use_bias=True)(points)
+        local = points if cluster is None else points[cluster] + dense("skip")(embedded)
+        return VertexFeatures(local, encoding.global_token, normals=inputs.canonical_normals)
 
 
 def check_views(inputs: HumanGSInputs, most: int | None) -> None:
@@ -73,44 +78,15 @@ def check_views(inputs: HumanGSInputs, most: int | None) -> None:
         raise ValueError(f"{len(inputs.images)} photos: this system takes {most}")
 
 
-class TwoStreams(nn.Module):
-    """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
-
-    config: TwoStreamReader
-    runtime: Runtime
-
-    @nn.compact
-    def __call__(
-        self, positions: Float[Array, "n 3"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
-    ) -> Float[Array, "n d"]:
-        config = self.config
-        dense = lambda name: nn.Dense(config.width, kernel_init=INIT, name=name)
-        embedded = dense("position_out")(jax.nn.silu(dense("position_in")(positional_encoding(positions))))
-        points, cluster = embedded, None
-        if config.pooling > 1:
-            cluster, clusters = (
-                along_curve(positions, CURVE_REACH) // config.pooling,
-                -(-len(positions) // config.pooling),
-            )
-            members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
-            points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
-        tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))
-        present = jnp.ones(len(tokens)) if count is None else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
-        pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
-        for index in range(config.blocks):
-            block = TwoStreamBlock(config, self.runtime, index + 1 == config.blocks, name=f"block_{index}")
-            points, tokens = block(points, tokens, count, pooled)
-        points = layer_norm(None, "norm", use_bias=True)(points)
-        return points if cluster is None else points[cluster] + dense("skip")(embedded)
-
-
 class TwoStreamBlock(nn.Module):
     """Points (n, d) and tokens (l, d) -> both. The `last` block returns the tokens unchanged, as nothing reads them.
 
     The modulation starts as the identity, and gates at 0 (Peebles & Xie 2023, https://arxiv.org/abs/2212.09748).
     """
 
-    config: TwoStreamReader
+    width: int
+    mlp_ratio: int
+    head_width: int
     runtime: Runtime
     last: bool
 
@@ -122,8 +98,7 @@ class TwoStreamBlock(nn.Module):
         count: Int[Array, ""] | None,
         pooled: Float[Array, " d"],
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
-        config, dtype = self.config, self.runtime.compute_dtype
-        width, vertices = config.width, len(points)
+        dtype, width, vertices = self.runtime.compute_dtype, self.width, len(points)
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
 
         def modulations(name, number):
@@ -133,7 +108,7 @@ class TwoStreamBlock(nn.Module):
         def heads(x, name, modulation, ask):
             shift, scale = modulation
             x = layer_norm(dtype, f"{name}_norm1")(x) * (1 + scale) + shift
-            made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, config.head_width)
+            made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, self.head_width)
             k, v, *q = jnp.split(made, 2 + ask, axis=1)
             rms = lambda y, which: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm")(y)
             return [rms(k, "k"), v, *(rms(y, "q") for y in q)]
@@ -142,7 +117,7 @@ class TwoStreamBlock(nn.Module):
             gate1, shift, scale, gate2 = modulation
             x = x + gate1 * dense(width, f"{name}_out")(seen.reshape(len(x), width))
             hidden = layer_norm(dtype, f"{name}_norm2")(x) * (1 + scale) + shift
-            hidden = jax.nn.gelu(dense(config.mlp_ratio * width, f"{name}_mlp_in")(hidden), approximate=False)
+            hidden = jax.nn.gelu(dense(self.mlp_ratio * width, f"{name}_mlp_in")(hidden), approximate=False)
             return x + gate2 * dense(width, f"{name}_mlp_out")(hidden)
 
         of_points, of_tokens = modulations("points", 6), modulations("tokens", 2 if self.last else 6)
@@ -150,6 +125,6 @@ class TwoStreamBlock(nn.Module):
         token_k, token_v, *token_q = heads(tokens, "tokens", of_tokens[:2], ask=not self.last)
         k, v, q = jnp.concatenate([k, token_k]), jnp.concatenate([v, token_v]), jnp.concatenate([q, *token_q])
         total = None if count is None else vertices + count
-        seen = attention(q, k, v, total, self.runtime.attention, self.runtime.attention_chunk)
+        seen = attention(q, k, v, total, self.runtime.attention)
         points = update(points, seen[:vertices], "points", of_points[2:])
         return points, tokens if self.last else update(tokens, seen[vertices:], "tokens", of_tokens[2:])

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.network.convolution import Convolution
+from humangs_jax.network.maps import Convolution
 from humangs_jax.network.upsampler import KAIMING
 from humangs_jax.network.vertex_decoder import LAST_STD
 

@@ -47,7 +47,7 @@ from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
-from humangs_jax.network.runtime import RUNTIMES, Runtime
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import Refinement, refine_with_report
 from humangs_jax.rendering.splatting import Rendering
@@ -111,14 +111,18 @@ class Settings:
 
 PRESETS: Presets[Settings] = Presets(
     {
-        "realtime": Settings(views=4, runtime=RUNTIMES["realtime"], splat="fast"),
+        "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000), splat="fast"),
         "balanced": Settings(
-            views=4, runtime=RUNTIMES["balanced"], refine_iterations=4, refine_size=256, splat="near_exact"
+            views=4,
+            runtime=Runtime(crop=True, body_vertices=2000),
+            refine_iterations=4,
+            refine_size=256,
+            splat="near_exact",
         ),
         "quality": Settings(
-            views=4, runtime=RUNTIMES["quality"], refine_iterations=4, refine_size=512, splat="near_exact"
+            views=4, runtime=Runtime(crop=True), refine_iterations=4, refine_size=512, splat="near_exact"
         ),
-        "best": Settings(runtime=RUNTIMES["best"], refine_iterations=4, refine_steps=100, refine_size=512),
+        "best": Settings(runtime=Runtime(crop=True), refine_iterations=4, refine_steps=100, refine_size=512),
     },
     "; those of training are in humangs_jax.training.config",
 )

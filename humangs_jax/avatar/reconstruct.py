@@ -27,8 +27,7 @@ from humangs_jax.geometry.camera import camera_values
 from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
-from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import HumanGSOutputs
+from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.splatting import round_up
@@ -45,7 +44,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
     its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
-    correction of a frame, see `avatar.targets`. Worlds that are not y-up are turned for the network (`data.views.upright`); the
+    correction of a frame. Worlds that are not y-up are turned for the network (`data.views.upright`); the
     avatar then has no light, whose directions would be those of another world. Views whose mask does not show the person are left
     out (`data.usable_views`), and the exposure of the others is made equal (`data.exposure`).
 
@@ -135,8 +134,7 @@ def _stacked(config, captures):
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
     capacity = 0 if config.tokens == "all" else round_up(int(_needed_tokens(inputs, config)))
-    # vertex_capacity: reading all vertices is 2 % of the time
-    return config.with_runtime(token_capacity=capacity, vertex_capacity=None)
+    return config.with_runtime(token_capacity=capacity)
 
 
 @checked_arguments

@@ -127,7 +127,7 @@ class Processes:
 
     def join(self) -> None:
         """Join the other processes, if there are any. Raises: see `join_processes`."""
-        from humangs_jax.training.processes import join_processes
+        from humangs_jax.training.sharding import join_processes
 
         if self.distributed or self.coordinator is not None:
             join_processes(self.coordinator, self.processes, self.process)

@@ -6,7 +6,7 @@ Numbers are annotated with their range, which every way to make a configuration 
     class Fit:
         steps: Annotated[int, Range(1, 1000)] = 100
 
-A field annotated with a `typing.Protocol` may hold any `part` that follows it. Its JSON names the class under "kind", as
+A field annotated with a class of `Part` may hold any `part` that derives from it. Its JSON names the class under "kind", as
 "PatchTransformer". Reading imports nothing: a part of another package is known once its module is imported.
 """
 
@@ -130,7 +130,7 @@ def check_fields(config: Any) -> None:
     Any integer and any real number will do. Raises: ValueError naming class and field.
     """
     for name, annotation in _annotations(type(config)).items():
-        if not _fits(value := getattr(config, name), annotation):
+        if name in field_names(type(config)) and not _fits(value := getattr(config, name), annotation):
             raise ValueError(f"{type(config).__name__}: {name}: expected {_in_words(annotation)}, got {value!r}")
 
 
@@ -166,7 +166,7 @@ def _in_words(annotation: Any) -> str:
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def configuration(cls: type[T]) -> type[T]:
     """A frozen dataclass whose fields are checked when it is made: ValueError naming class, field, value and what it may be."""
-    own = vars(cls).get("__post_init__")
+    own = getattr(cls, "__post_init__", None)
 
     def __post_init__(self):
         check_fields(self)
@@ -176,15 +176,32 @@ def configuration(cls: type[T]) -> type[T]:
             own(self)
 
     setattr(cls, "__post_init__", __post_init__)  # noqa: B010 (a class of any kind)
-    return dataclasses.dataclass(frozen=True)(cls)
+    return cls if issubclass(cls, Part) else dataclasses.dataclass(frozen=True)(cls)
+
+
+class Part:
+    """Base of what a field may hold by its registered name: modules of Linen, which are frozen dataclasses already."""
+
+
+PLACE = ("parent", "name")
+"""Fields of a `Part` that say where it is, and are no configuration."""
+
+
+@functools.cache
+def field_names(cls: Any) -> tuple[str, ...]:
+    """Names of the fields of a configuration."""
+    place = PLACE if issubclass(cls, Part) else ()
+    return tuple(field.name for field in dataclasses.fields(cls) if field.name not in place)
 
 
 _PARTS: dict[str, type] = {}
 
 
-@typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def part(cls: type[T]) -> type[T]:
-    """A `configuration` that files may name by its class. Raises: ValueError if there is another part of this name."""
+    """A `Part` that files may name by its class; its fields are checked as those of a `configuration`.
+
+    Raises: ValueError if there is another part of this name.
+    """
     other = _PARTS.get(cls.__name__, cls)
     if other.__module__ != cls.__module__:  # the cell of a notebook may run again
         raise ValueError(f"part {cls.__name__} of {cls.__module__}: {other.__module__} has one of this name")
@@ -205,9 +222,9 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
 
 def _varied(config: Any, names: list[str], value: Any, path: str) -> Any:
-    fields = [f.name for f in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
+    fields = field_names(type(config)) if dataclasses.is_dataclass(config) else ()
     if names[0] not in fields:
-        raise ValueError(f"{path}: {type(config).__name__} has no field {names[0]!r}; its fields are {fields}")
+        raise ValueError(f"{path}: {type(config).__name__} has no field {names[0]!r}; its fields are {list(fields)}")
     if names[1:]:
         value = _varied(getattr(config, names[0]), names[1:], value, path)
     return dataclasses.replace(config, **{names[0]: value})
@@ -229,7 +246,7 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
 def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
     """Of the fields that have one."""
     hints = typing.get_type_hints(cls, include_extras=True)
-    found = {field.name: tuple(marks_in(hints[field.name], Range)) for field in dataclasses.fields(cls)}
+    found = {name: tuple(marks_in(hints[name], Range)) for name in field_names(cls)}
     return {name: ranges for name, ranges in found.items() if ranges}
 
 
@@ -253,18 +270,18 @@ def _plain(value: Any, kind: bool = False) -> Any:
         if kind and _PARTS.get(type(value).__name__) is not type(value):
             raise ValueError(f"{type(value).__name__} is no registered part: decorate its class with `part`")
         named = {KIND: type(value).__name__} if kind else {}
-        names = [field.name for field in dataclasses.fields(value)]
-        return named | {name: _plain(getattr(value, name), _holds_part(annotations[name])) for name in names}
+        plain = lambda name: _plain(getattr(value, name), _holds_part(annotations[name]))
+        return named | {name: plain(name) for name in field_names(type(value))}
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
 def _holds_part(annotation: Any) -> bool:
     """Whether a field holds a part, or a part or None."""
-    return _is_protocol(annotation) or any(map(_is_protocol, typing.get_args(annotation)))
+    return any(_is_part(option) for option in (annotation, *typing.get_args(annotation)))
 
 
-def _is_protocol(annotation: Any) -> bool:
-    return getattr(annotation, "_is_protocol", False)
+def _is_part(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, Part)
 
 
 def config_from_json(cls: type[T], text: str) -> T:
@@ -282,7 +299,7 @@ def config_from_json(cls: type[T], text: str) -> T:
 def _build(annotation: Any, value: Any, path: str) -> Any:
     """A JSON value, converted to its annotation."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if _is_protocol(annotation) and isinstance(value, dict):
+    if _is_part(annotation) and isinstance(value, dict):
         cls = _find_part(value.get(KIND), annotation, path)
         return _build_dataclass(cls, {name: x for name, x in value.items() if name != KIND}, path)
     if dataclasses.is_dataclass(annotation):
@@ -300,26 +317,20 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
         if len(items) == len(value):
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
-    elif not _is_protocol(annotation) and _fits(value, annotation):
+    elif not _is_part(annotation) and _fits(value, annotation):
         most = LARGEST if annotation is float else LARGEST_INTEGER
         if not isinstance(value, int | float) or abs(value) <= most:  # nor NaN
             return float(value) if annotation is float else value
     raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
 
 
-def _find_part(kind: Any, protocol: Any, path: str) -> type:
+def _find_part(kind: Any, base: Any, path: str) -> type:
     """The class that a "kind" names."""
-    # not issubclass: it refuses protocols with attributes, and a field without a default is no attribute of its class
-    members = [member for member in vars(protocol) if not member.startswith("_")]
-    known = {
-        name: cls
-        for name, cls in _PARTS.items()
-        if all(hasattr(cls, member) or member in _annotations(cls) for member in members)
-    }
+    known = {name: cls for name, cls in _PARTS.items() if issubclass(cls, base)}
     name = kind.rpartition(".")[2] if isinstance(kind, str) else ""  # the first files say in which module, too
     if name not in known:
         raise ValueError(
-            f"{path}.{KIND}: expected the name of a registered {protocol.__name__}, one of {', '.join(sorted(known))} "
+            f"{path}.{KIND}: expected the name of a registered {base.__name__}, one of {', '.join(sorted(known))} "
             f"(others: import their module first); got {kind!r}"
         )
     return known[name]
@@ -328,11 +339,12 @@ def _find_part(kind: Any, protocol: Any, path: str) -> type:
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
-    annotations = typing.get_type_hints(cls)
+    annotations = {name: hint for name, hint in typing.get_type_hints(cls).items() if name in field_names(cls)}
     if unknown := sorted(set(values) - set(annotations)):
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
     fields = {name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()}
-    needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
+    required = lambda field: field.default is field.default_factory is dataclasses.MISSING
+    needed = [f.name for f in dataclasses.fields(cls) if f.name in annotations and required(f)]
     if missing := [name for name in needed if name not in fields]:
         raise ValueError(f"{path}.{missing[0]} is missing")
     for name, value in fields.items():

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -188,3 +189,10 @@ def replace(tree: T, **changes: Any) -> T:
     for name in names:
         object.__setattr__(copy, name, changes.get(name, getattr(tree, name)))
     return copy
+
+
+def inexact_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
+    """(path, leaf) of all floating-point arrays of a tree, as "cameras.K"; "" for a bare array."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        if hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.inexact):
+            yield jax.tree_util.keystr(path, simple=True, separator="."), leaf

@@ -25,9 +25,8 @@ from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.pixel_aligned import project_vertices, visible_vertices
-from humangs_jax.network.surface_map import surface_texels
+from humangs_jax.network.parts import HumanGSInputs, subject_unit
+from humangs_jax.network.reader import project_vertices, visible_vertices
 from humangs_jax.rendering.mesh.position_map import (
     BACKGROUND,
     BACKGROUND_DEPTH,
@@ -132,7 +131,7 @@ def _remeshed(key, vertices, edge, fewer, longest, wanted):
         body = replace(coarse, spacing=jnp.full(len(coarse.template), wider, body.template.dtype))
     if longest is not None:
         body = split_long_edges(body, longest)
-    body = body if wanted is None else replace(body, texels=surface_texels(body, wanted))
+    body = body if wanted is None else replace(body, texels=wanted.texels(body))
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.targets import show_targets
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Float, Int
@@ -28,7 +27,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_image
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
-from humangs_jax.network.pixel_aligned import (
+from humangs_jax.network.reader import (
     photo_colors,
     project_vertices,
     visible_vertices,
@@ -277,13 +276,13 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
 
 def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
-    """Reconstruction from the inputs of a case; networks that run again for every view are run so, see `avatar.targets`."""
+    """Reconstruction from the inputs of a case; networks with a driver are run again for every view."""
 
     def method(case: Case, background: float) -> Predicted:
         if case.inputs is None:
             raise ValueError(f"{case.name}: no inputs to reconstruct from")
-        if config.architecture.runs_per_target:
-            images, alpha = show_targets(variables, config, case.inputs, case.truth, background)
+        if (driver := config.architecture.driver) is not None:
+            images, alpha = driver.show(variables, config, case.inputs, case.truth, background)
             return Predicted(images, alpha, tuple(range(len(images))))
         return draw_views(reconstruct(variables, config, case.inputs), case.truth, background)
 

@@ -64,6 +64,9 @@ class LossNetworks:
     lpips: Lpips | None = None
 
 
+NO_NETWORKS = LossNetworks()
+
+
 @contextlib.contextmanager
 def _named(path: Path) -> Generator[None]:
     try:

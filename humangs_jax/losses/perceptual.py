@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.numerics import absolute, at_least_float32, safe_sqrt
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.network.convolution import convolve
+from humangs_jax.network.maps import convolve
 
 
 @pytree_dataclass

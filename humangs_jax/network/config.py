@@ -10,25 +10,21 @@ import jax
 
 from humangs_jax.core.configuration import configuration
 from humangs_jax.network.encoder import PatchTransformer
-from humangs_jax.network.parts import Decoder, Driver, Encoder, Pass, PixelDecoder, Reader
+from humangs_jax.network.parts import Decoder, Driver, Encoder, Pass, Reader
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
-from humangs_jax.network.stages import StageCaller, call
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
 
 @configuration
 class Architecture:
-    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor.
+    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor."""
 
-    driver: corrects the Gaussians for every driving frame; None: skinning alone moves them.
-    """
-
-    encoder: Encoder = dataclasses.field(default_factory=PatchTransformer)
-    reader: Reader = dataclasses.field(default_factory=PixelAlignedReader)
-    decoder: Decoder = dataclasses.field(default_factory=VertexDecoder)
+    encoder: Encoder = PatchTransformer()
+    reader: Reader = PixelAlignedReader()
+    decoder: Decoder = VertexDecoder()
     driver: Driver | None = None
+    """Draws every target anew; None: skinning alone moves the Gaussians."""
 
     def __post_init__(self):
         """Raises ValueError for parts that do not fit together."""
@@ -38,35 +34,18 @@ class Architecture:
                 raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo color to correct")
             if reader.shells and decoder.frame != "normal":
                 raise ValueError('reader.shells lie along the normals: they need decoder.frame = "normal"')
-        if self.driver is not None and self.draws_pixels:
-            raise ValueError(f"driver: {type(decoder).__name__} makes no Gaussians that it could correct")
         if len(maps := self._surface_maps) > 1:
             raise ValueError(f"surface_map: expected one for all parts, got {sorted(map(str, maps))}")
 
     @property
-    def parts(self) -> tuple[Encoder | Reader | Decoder | Driver, ...]:
-        """Those that there are."""
-        return tuple(part for part in (self.encoder, self.reader, self.decoder, self.driver) if part is not None)
-
-    @property
-    def draws_pixels(self) -> bool:
-        """Whether the decoder makes images and no Gaussians: nothing can be animated or exported."""
-        return isinstance(self.decoder, PixelDecoder)
-
-    @property
-    def runs_per_target(self) -> bool:
-        """Whether a part of the network runs again for every target: see `avatar.targets`."""
-        return self.driver is not None or self.draws_pixels
-
-    @property
-    def surface_map(self) -> SurfaceMap | None:
-        """The map of the body's surface that parts work on."""
+    def surface_map(self) -> Any:
+        """The map of the body's surface that parts work on, see `network.parts`; None: they work on none."""
         return next(iter(self._surface_maps), None)
 
     @property
-    def _surface_maps(self) -> set[SurfaceMap]:
-        wanted = (getattr(part, "surface_map", None) for part in self.parts)
-        return {one for one in wanted if one is not None}
+    def _surface_maps(self) -> set[Any]:
+        parts = self.encoder, self.reader, self.decoder, self.driver
+        return {getattr(part, "surface_map", None) for part in parts} - {None}
 
 
 def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
@@ -103,9 +82,9 @@ class HumanGSConfig:
         """The selection of tokens in force."""
         return self.run().tokens
 
-    def run(self, train: bool = False, axis_name: Any = None, stage: StageCaller = call) -> Pass:
+    def run(self, train: bool = False, axis_name: Any = None) -> Pass:
         """How one pass of this network runs."""
-        return Pass(self.conventions, self.runtime, train, axis_name, stage)
+        return Pass(self.conventions, self.runtime, train, axis_name)
 
     @property
     def image_size(self) -> int:

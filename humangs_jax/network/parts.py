@@ -1,46 +1,95 @@
-"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged.
+"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged, and what passes between them.
 
     encoding = encoder(photos)        features = reader(encoding)        Gaussians = decoder(features)
 
-That is one pass per person. What runs again for every target is a driver, which corrects the canonical Gaussians for a pose
-(`Driver`), or a decoder that makes images without Gaussians (`PixelDecoder`). Both are called in `network.humangs` alone.
+A part is a Linen module: its fields are its configuration, which weights files record by the name of the class. It gets what the
+part before it has made, the inputs, and how this pass runs; it knows no other part. A new part is a new file with a class that
+derives from `Encoder`, `Reader`, `Decoder` or `Driver` and has the decorator `core.configuration.part`, and one line of a preset
+that names it: see `experiments/systems`.
 
-A part is a class with the decorator `core.configuration.part`: its fields are its configuration, which weights files record by
-the name of the class, and its methods are pure functions. A new part is a new file with such a class, and one line of a preset
-that names it: see `experiments/systems`. Variables of a part are {"params": ...,
-"batch_stats": ...}, the latter only where it has running statistics, which only encoders update.
+A part that works on a map of the body's surface has it in a field `surface_map`: its `shape`, and `texels(body)`, which
+`data.views.gaussian_body` asks for; the inputs carry them. A driver for bodies of one number of joints says so in a field
+`joints`.
 
-A part that works on a map of the body's surface says which one in a field or property `surface_map`, see `network.surface_map`.
+Lengths inside the network are normalised units: metres divided by s = (height of the canonical body) / 1.8, so that every body is
+1.8 high. Means and scales are multiplied by s at the end.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
+import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 
-from humangs_jax.body.model import BodyPose
-from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.body.model import BodyPose, Texels
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
+from humangs_jax.core.configuration import Part
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
-from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import Rendering
 
+T = TypeVar("T")
 Variables = dict[str, Any]
+TARGET_HEIGHT = 1.8
+"""Height of every canonical body in normalised units."""
+
+
+@pytree_dataclass
+class HumanGSInputs:
+    """The photos of one subject, and the posed body in each of them.
+
+    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric,
+    the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical
+    position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
+    on background. foreground: (v, h, w) pixels of the person (used where tokens are "foreground"). view_count: the number of
+    real views, which come first; the others are padding and change nothing. None: all are real. posed_normals: (v, n, 3)
+    unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame is "normal". spacing: (n,) distance
+    between vertices relative to the mesh that the weights were trained with; None: 1. skinning_weights: (n, j) of the body, and
+    texels: the map of its surface, for decoders whose Gaussians are not those of vertices.
+    """
+
+    images: Float[Array, "v h w 3"]
+    cameras: Camera
+    posed_vertices: Float[Array, "v n 3"]
+    canonical_vertices: Float[Array, "n 3"]
+    position_maps: Float[Array, "v h w 3"]
+    depth_maps: Float[Array, "v h w"]
+    foreground: Bool[Array, "v h w"]
+    view_count: Int[Array, ""] | None = None
+    posed_normals: Float[Array, "v n 3"] | None = None
+    canonical_normals: Float[Array, "n 3"] | None = None
+    spacing: Float[Array, " n"] | None = None
+    skinning_weights: Float[Array, "n j"] | None = None
+    texels: Texels | None = None
+
+    @property
+    def present(self) -> Bool[Array, " v"]:
+        """Which views are not padding."""
+        views = jnp.arange(len(self.images))
+        return views < (len(self.images) if self.view_count is None else self.view_count)
+
+
+def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
+    """s, metres per normalised unit: the canonical body's height over 1.8."""
+    y = canonical_vertices[:, 1]
+    return (jnp.max(y) - jnp.min(y)) / TARGET_HEIGHT
 
 
 class Pass(NamedTuple):
     """How one pass of the network runs: all that a part knows besides its own fields. See `HumanGSConfig.run`.
 
     train: batch norms use this subject's statistics and update the running ones. axis_name: vmap axes over which those are
-    shared. stage: how named stages are called, see `network.stages`.
+    shared.
     """
 
     conventions: Conventions
     runtime: Runtime
     train: bool = False
     axis_name: str | tuple[str, ...] | None = None
-    stage: StageCaller = call
 
     @property
     def tokens(self) -> TokenSelection:
@@ -48,25 +97,40 @@ class Pass(NamedTuple):
         return self.runtime.tokens or self.conventions.tokens
 
 
-class Encoding(NamedTuple):
+@pytree_dataclass
+class Packing:
+    """Which patches became tokens.
+
+    indices: (l,) of the kept patches, in their order; the number of patches itself where a token is padding.
+    count: number of real tokens, which come first; the rest is padding.
+    """
+
+    indices: Int[Array, " l"]
+    count: Int[Array, ""]
+
+
+@pytree_dataclass
+class Encoding:
     """What an encoder makes of the photos.
 
     maps: (v, h', w', d) features. global_token: (e,), or None. dropped_tokens: foreground patches for which the token
-    capacity had no room.
+    capacity had no room. packing: the patches of which the maps know something; None: all. patch_size: side of a patch, pixels.
     """
 
     maps: Float[Array, "v h w d"]
     global_token: Float[Array, " e"] | None
     dropped_tokens: Int[Array, ""]
+    packing: Packing | None = None
+    patch_size: int = static_field(default=1)
 
 
 @pytree_dataclass
 class Shells:
     """What the photos show at the s points along the normal of each vertex.
 
-    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible and on the person, weighted
-    by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the number of
-    views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
+    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible and in the foreground,
+    weighted by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the
+    number of views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
     outside of the visual hull. A view that does not contain the point is ignored; without any view both are 1.
     """
 
@@ -83,7 +147,6 @@ class VertexFeatures:
 
     local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
     shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
-    dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
     """
 
     local: Float[Array, "n d"]
@@ -92,7 +155,6 @@ class VertexFeatures:
     visible_fraction: Float[Array, " n"] | None = None
     shells: Shells | None = None
     normals: Float[Array, "n 3"] | None = None
-    dropped_reads: Int[Array, ""] | None = None
 
 
 @pytree_dataclass
@@ -103,103 +165,126 @@ class HumanGSOutputs:
     the vertex, or of each Gaussian from where it belongs, normalised units (for the tightness loss, which is 0 for None).
     shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None without shells. skinning_offsets:
     (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground
-    patches for which the token capacity had no room. dropped_reads: vertices, summed over views, for which the vertex capacity
-    had no room. skinning_weights: (g, j), rows of sum 1, of Gaussians that do not belong to one vertex each; None: the body's.
-    scene: what a driver or a `PixelDecoder` works from for every target; a decoder may set it, else the pass sets the features
-    where there is a driver.
+    patches for which the token capacity had no room. skinning_weights: (g, j), rows of sum 1, of Gaussians that do not belong to
+    one vertex each; None: the body's. scene: what a driver works from for every target: the features, unless a decoder sets it.
     """
 
     gaussians: Gaussians
     tight_offsets: Float[Array, "n t 3"] | None = None
     skinning_offsets: Float[Array, "g j"] | None = None
     dropped_tokens: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
-    dropped_reads: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
     shell_spread: Float[Array, "n k"] | None = None
     skinning_weights: Float[Array, "g j"] | None = None
-    scene: Any = None
+    scene: PyTree = None
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is no Gaussian, as a `PixelDecoder` leaves it."""
+        """Whether there is no Gaussian, as where a driver makes images without them."""
         return self.gaussians.opacities.shape[-1] == 0
 
 
-@runtime_checkable
-class Encoder(Protocol):
-    """Photos -> `Encoding`."""
+class Target(NamedTuple):
+    """What a driver knows of a target.
 
-    @property
-    def patch_size(self) -> int:
-        """Side of a token's patch, pixels: the side of photos is a multiple of it. 1 where any side will do."""
-        ...
-
-    def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """Fresh variables; only shapes of `inputs` matter."""
-        ...
-
-    def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
-        """The encoding, and the batch statistics: updated ones where `run.train`."""
-        ...
-
-
-@runtime_checkable
-class Reader(Protocol):
-    """`Encoding` -> features of the body, in whatever form the decoder takes."""
-
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """Fresh variables; {} for a reader that learns nothing."""
-        ...
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Any:
-        """Features."""
-        ...
-
-
-@runtime_checkable
-class Decoder(Protocol):
-    """Features of the body -> canonical Gaussians."""
-
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """Fresh variables."""
-        ...
-
-    def apply(self, variables: Variables, features: Any, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        """Gaussians; `dropped_tokens` is set by the pass."""
-        ...
-
-
-@runtime_checkable
-class Driver(Protocol):
-    """Canonical Gaussians -> canonical Gaussians of one driving frame, by a network that runs again for every frame."""
-
-    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """Fresh variables; `features` are those of the reader."""
-        ...
-
-    def apply(
-        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
-    ) -> HumanGSOutputs:
-        """The outputs with the Gaussians of one pose, before skinning; `posed`: the body's vertices in that pose, metres."""
-        ...
-
-
-@runtime_checkable
-class PixelDecoder(Decoder, Protocol):
-    """A decoder that makes images of targets without Gaussians. `apply` gives `scene_outputs`: nothing that could be animated.
-
-    Images are on white: the background is not known to it, and there is no alpha.
+    vertices: (n, 3) of the posed body, metres. pixels: (h, w, 9) of every pixel the ray (moment, direction) and the canonical
+    position of the body there (1 on background), normalised units, for drivers that make images; else None.
     """
 
+    pose: BodyPose
+    vertices: Float[Array, "n 3"]
+    pixels: Float[Array, "h w 9"] | None = None
+
+
+class Drawn(NamedTuple):
+    """Images of the v targets of one subject, and what losses compare besides.
+
+    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities: (g,), tight_offsets,
+    shell_spread: of the Gaussians that were drawn; opacities None: there were none, and no alpha or depth either.
+    """
+
+    rendering: Rendering
+    spread: Float[Array, "v h w"] | None = None
+    opacities: Float[Array, " g"] | None = None
+    tight_offsets: Float[Array, "n t 3"] | None = None
+    shell_spread: Float[Array, "n k"] | None = None
+
+
+class Encoder(Part, nn.Module):
+    """Photos -> `Encoding`. Alone among parts it may have running statistics, in the collection "batch_stats".
+
+    patch_size: field; the side of photos is a multiple of it, pixels.
+    """
+
+    patch_size: int = 1
+
+    def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
+        """The encoding."""
+        raise NotImplementedError
+
+
+class Reader(Part, nn.Module):
+    """`Encoding` -> features of the body, in whatever form the decoder takes."""
+
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> PyTree:
+        """Features."""
+        raise NotImplementedError
+
+
+class Decoder(Part, nn.Module):
+    """Features of the body -> canonical Gaussians."""
+
+    def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+        """Gaussians; `dropped_tokens` is set by the pass."""
+        raise NotImplementedError
+
+
+class Driver(Part, nn.Module):
+    """A part that runs again for every target and draws it; without one, canonical Gaussians move by skinning alone."""
+
+    has_alpha = True
+    """Whether its images can be put on any background; else they are on white."""
+
+    def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> PyTree:
+        """The outputs corrected for a target, or its image."""
+        raise NotImplementedError
+
+    @nn.nowrap
     def draw(
-        self, variables: Variables, scene: Any, queries: Float[Array, "v h w 9"], run: Pass
-    ) -> Float[Array, "v h w 3"]:
-        """Images in [0, 1]. queries: of every target pixel the ray (moment, direction) and the canonical position of the body in
-        the target's pose (1 on background), normalised units; sides are multiples of the encoder's patch size.
+        self,
+        variables: Variables,
+        outputs: HumanGSOutputs,
+        body: PyTree,
+        photos: PyTree,
+        targets: PyTree,
+        backgrounds: Float[Array, "v 3"],
+        config: PyTree,
+    ) -> Drawn:
+        """The targets (`SubjectViews`) of one subject as a `TrainConfig` has them; `training.forward.draw_targets` for others."""
+        raise NotImplementedError
+
+    @nn.nowrap
+    def show(
+        self, variables: Variables, config: PyTree, inputs: PyTree, targets: PyTree, background: float
+    ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
+        """Images and alpha of the person of one capture in the views of another, for evaluations. variables, config: the
+        network's.
         """
-        ...
+        raise NotImplementedError
 
 
-def scene_outputs(scene: Any) -> HumanGSOutputs:
-    """Outputs without Gaussians, of a `PixelDecoder`."""
-    empty = lambda *shape: jnp.zeros((0, *shape))
-    return HumanGSOutputs(Gaussians(empty(3), empty(4), empty(3), empty(), empty(3)), scene=scene)
+class Watched(nn.Module):
+    """What `stage` calls: each entry of the dict that it returns is a stage of its own if `apart`."""
+
+    apart: bool = False
+
+    def __call__(self, function: Callable[..., T], *learned: Any) -> T:
+        """function(*learned)."""
+        return function(*learned)
+
+
+def stage(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
+    """function(*learned), a step beside the network: Linen's interceptors see it as they see the network's modules.
+
+    learned: the arguments that depend on parameters.
+    """
+    return Watched(apart, parent=None, name=name)(function, *learned)

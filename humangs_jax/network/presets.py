@@ -1,7 +1,5 @@
 """Named configurations: `published` runs the released weights, `paper` is as described, `small` is what we ship."""
 
-import dataclasses
-
 from humangs_jax.core.configuration import Presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
@@ -82,7 +80,7 @@ def tiny() -> HumanGSConfig:
                 upsampler=UpsamplerConfig(hidden=8),
             ),
             PixelAlignedReader(output_width=8, sample_rgb=True, shells=SHELLS),
-            dataclasses.replace(decoder, hidden=16),
+            decoder.clone(hidden=16),
         ),
         Conventions(image_size=32, tokens="foreground"),
         Runtime(token_capacity=16),

@@ -1,128 +1,220 @@
 """The paper's reader: posed vertices projected into the photos, features read there, views pooled.
 
-Vertices can also read the photos themselves, at the surface and at distances along their normals (`network.pixel_aligned`).
+Vertices can also read the photos themselves, at the surface and on shells: points off the body's surface, looked up in all
+photos, where loose clothes and hair are, and their color. Each vertex has one point at every distance of a list along its posed
+normal. Where a photo shows the background, the point is not part of the person. Points that all photos show on the person are in
+the visual hull (Laurentini 1994). Lengths of functions here are normalised units: cameras, vertices and depth maps alike.
 """
 
 import itertools
 import math
-from typing import cast
+from collections.abc import Callable
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.configuration import Spread, Width, part
-from humangs_jax.network.bilinear import KERNEL, sample_bilinear, sample_neighborhoods, texel_indices
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, Pass, Shells, Variables, VertexFeatures
-from humangs_jax.network.pixel_aligned import (
-    COUNT_EPSILON,
-    dropped_reads,
-    photo_colors,
-    project_vertices,
-    sample_shells,
-    sum_over_views,
-    visible_vertices,
+from humangs_jax.geometry import transform
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.network.maps import (
+    KERNEL,
+    PixelGrid,
+    convolve_neighborhoods,
+    sample_bilinear,
+    sample_nearest,
+    sample_neighborhoods,
+    texel_indices,
 )
-from humangs_jax.network.upsampler import OutputConvolution
+from humangs_jax.network.parts import Encoding, HumanGSInputs, Pass, Reader, Shells, VertexFeatures, subject_unit
+from humangs_jax.network.upsampler import KAIMING
+
+DEPTH_EPSILON = 1e-6
+"""Added to z before the division, as published."""
+DEPTH_TOLERANCE = 0.05
+"""A vertex counts as seen when it lies less than this behind the rasterized surface (normalised units)."""
+COUNT_EPSILON = 1e-8
+"""Added to the number of pooled views, as published: no view at all gives zeros."""
+UNSEEN_COLOR = 0.5
+"""Photo color of a vertex that no view sees."""
+WEIGHT_EPSILON = 1e-6
+"""Views count by how much the surface faces them; a point with less than this in all is unseen."""
+SQUARED_DISTANCE_EPSILON = 1e-6
+"""Least squared distance between a camera and a point."""
 
 
 @part
-class PixelAlignedReader:
-    """What vertices read.
-
-    output_width: features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the maps are read as they
-    are. sample_rgb: also read the photo color at each vertex, averaged over the views that see it, and their fraction.
-    shells: ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none.
-    """
+class PixelAlignedReader(Reader):
+    """What vertices read."""
 
     output_width: Width | None = 768
+    """Features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the maps are read as they are."""
     sample_rgb: bool = False
+    """Also read the photo color at each vertex, averaged over the views that see it, and their fraction."""
     shells: tuple[Spread, ...] = ()
+    """Ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none."""
 
     def __post_init__(self):
         """Raises ValueError for distances that are not ascending."""
+        super().__post_init__()
         ascending = all(a < b for a, b in itertools.pairwise(self.shells))
         if not (ascending and all(0 <= x < math.inf for x in self.shells)):
             raise ValueError(f"shells {self.shells}: expected ascending distances, finite and at least 0")
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the output convolution; {} without one."""
-        if self.output_width is None:
-            return {}
-        channels = encoding.maps.shape[-1]
-        return cast(Variables, self.output(channels, run).init(key, jnp.zeros((1, KERNEL**2 * channels)), jnp.zeros(1)))
-
-    def output(self, channels: int, run: Pass) -> OutputConvolution:
-        """The last convolution, of maps with that many channels."""
-        assert self.output_width is not None
-        return OutputConvolution(self.output_width, channels, run.runtime.compute_dtype)
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+    @nn.compact
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        conventions, capacity = run.conventions, run.runtime.vertex_capacity
-        pixels, visible = project_and_test(inputs, run)
-        weights = view_weights(visible, inputs, run).astype(pixels.dtype)
-        size = (inputs.cameras.width, inputs.cameras.height)
-        maps = encoding.maps
-        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), conventions.pixel_grid)
+        grid, unit, maps = run.conventions.pixel_grid, subject_unit(inputs.canonical_vertices), encoding.maps
+        cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
+        pixels, visible = project_and_test(inputs, grid)
+        pooled = visible if run.conventions.pool == "visible" else inputs.present[:, None]
+        weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
+        size = (cameras.width, cameras.height)
+        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), grid)
         read = sample_bilinear if self.output_width is None else sample_neighborhoods
-        sums = sum_over_views(read, maps, indices, weights, capacity)
         counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
-        local = jax.tree.map(lambda x: jnp.einsum("n...,n->n...", x, 1 / counts), sums)
+        mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts)
+        local = jax.tree.map(mean, sum_over_views(read, maps, indices, weights))
         if self.output_width is not None:
-            local = self.output(maps.shape[-1], run).apply(variables, *local)
-        colors = fraction = None
+            kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, maps.shape[-1], self.output_width))
+            bias = self.param("bias", nn.initializers.zeros, (self.output_width,))
+            local = convolve_neighborhoods(*local, kernel, bias, run.runtime.compute_dtype)
+        colors = fraction = shells = None
         if self.sample_rgb:
-            colors = photo_colors(inputs.images, pixels, visible, conventions.pixel_grid)
+            colors = photo_colors(inputs.images, pixels, visible, grid)
             fraction = (jnp.sum(visible, axis=0) / jnp.sum(inputs.present)).astype(pixels.dtype)
+        if self.shells:
+            if inputs.posed_normals is None:
+                raise ValueError("reader.shells needs posed_normals of the inputs, see `prepare_inputs`")
+            photos, points = (inputs.images, inputs.foreground, inputs.depth_maps), (vertices, inputs.posed_normals)
+            shells = sample_shells(*photos, cameras, *points, self.shells, inputs.present, grid)
         return VertexFeatures(
-            cast(Array, local),
-            encoding.global_token,
-            photo_colors=colors,
-            visible_fraction=fraction,
-            shells=read_shells(inputs, self.shells, run) if self.shells else None,
-            normals=inputs.canonical_normals,
-            dropped_reads=dropped_reads(weights, capacity),
+            local, encoding.global_token, colors, fraction, shells=shells, normals=inputs.canonical_normals
         )
 
 
-def read_shells(inputs: HumanGSInputs, distances: tuple[float, ...], run: Pass) -> Shells:
-    """The photos at points off the surface. Raises ValueError if the inputs have no posed normals."""
-    if inputs.posed_normals is None:
-        raise ValueError("reader.shells needs posed_normals of the inputs, see `prepare_inputs`")
-    unit = subject_unit(inputs.canonical_vertices)
-    return sample_shells(
-        inputs.images,
-        inputs.foreground,
-        inputs.depth_maps,
-        inputs.cameras.in_units(unit),
-        inputs.posed_vertices / unit,
-        inputs.posed_normals,
-        distances,
-        inputs.present,
-        run.conventions.pixel_grid,
-    )
-
-
-def project_and_test(inputs: HumanGSInputs, run: Pass) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
+def project_and_test(inputs: HumanGSInputs, grid: PixelGrid) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
     """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
     unit = subject_unit(inputs.canonical_vertices)
     cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
-    size, grid = (cameras.width, cameras.height), run.conventions.pixel_grid
-    see = lambda p, z, surface: visible_vertices(p, z, surface, size, grid)
+    see = lambda p, z, surface: visible_vertices(p, z, surface, (cameras.width, cameras.height), grid)
     return pixels, jax.vmap(see)(pixels, depths, inputs.depth_maps) & inputs.present[:, None]
 
 
-def view_weights(visible: Bool[Array, "v n"], inputs: HumanGSInputs, run: Pass) -> Bool[Array, "v n"]:
-    """Which views are pooled at each vertex."""
-    if run.conventions.pool == "visible":
-        return visible
-    return jnp.broadcast_to(inputs.present[:, None], visible.shape)
+def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
+    """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its plane or behind."""
+    p = transform.apply(camera.cam_from_world, vertices)
+    depth = p[:, 2]
+    divisor = depth + DEPTH_EPSILON
+    divisor = jnp.where(jnp.abs(divisor) < DEPTH_EPSILON, DEPTH_EPSILON, divisor)
+    focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])
+    return focal * p[:, :2] / divisor[:, None] + camera.K[:2, 2], depth
 
 
-def needed_reads(inputs: HumanGSInputs, run: Pass) -> Int[Array, ""]:
-    """The vertex capacity that these photos need: the most vertices for which any view is read."""
-    counted = view_weights(project_and_test(inputs, run)[1], inputs, run)
-    return jnp.max(jnp.sum(counted, axis=1, dtype=jnp.int32))
+def visible_vertices(
+    pixels: Float[Array, "n 2"],
+    depths: Float[Array, " n"],
+    depth_map: Float[Array, "h w"],
+    image_size: tuple[int, int],
+    grid: PixelGrid,
+) -> Bool[Array, " n"]:
+    """Which projected vertices lie inside the image, in front of the camera and not behind the rasterized surface.
+
+    depth_map: rasterized z, -1 on background, so that a vertex over background is unseen. image_size: (width, height).
+    """
+    height, width = depth_map.shape
+    indices = texel_indices(pixels, image_size, (width, height), grid)
+    surface = sample_nearest(depth_map, indices)
+    inside = jnp.all((pixels > 0) & (pixels < jnp.asarray(image_size, pixels.dtype)), axis=-1)
+    return inside & (depths > 0) & (depths < surface + DEPTH_TOLERANCE)
+
+
+def sum_over_views(
+    read: Callable[[Array, Array], PyTree],
+    maps: Float[Array, "v h w c"],
+    indices: Float[Array, "v n 2"],
+    weights: Float[Array, "v n"],
+) -> PyTree:
+    """Sum over views of weight * read(map of the view, texel indices), one view after the other: memory for one.
+
+    read: (h, w, c), (n, 2) -> a pytree of (n, ...).
+    """
+
+    @jax.checkpoint  # what was read is read again for gradients: it is larger than the maps
+    def add_view(total, view):
+        texels, positions, weight = view
+        add = lambda t, x: t + weight.reshape(-1, *[1] * (x.ndim - 1)) * x
+        return jax.tree.map(add, total, read(texels, positions)), None
+
+    shapes = jax.eval_shape(read, maps[0], indices[0])
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.result_type(x, weights)), shapes)
+    return jax.lax.scan(add_view, empty, (maps, indices, weights))[0]
+
+
+def photo_colors(
+    images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], grid: PixelGrid
+) -> Float[Array, "n 3"]:
+    """Mean photo color over the views that see each vertex, grey where none does."""
+    size = (images.shape[2], images.shape[1])
+    colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
+    counts = jnp.sum(visible, axis=0)[:, None]
+    mean = jnp.einsum("vnc,vn->nc", colors, visible.astype(colors.dtype)) / jnp.maximum(counts, 1)
+    return jnp.where(counts > 0, mean, UNSEEN_COLOR)
+
+
+def on_the_person(shells: Shells) -> Bool[Array, " n"]:
+    """Whether any photo shows the person at any distance along the normal of a vertex; true for what no photo contains."""
+    return jnp.any(shells.inside > 0, axis=1)
+
+
+def sample_shells(
+    images: Float[Array, "v h w 3"],
+    foreground: Bool[Array, "v h w"],
+    depth_maps: Float[Array, "v h w"],
+    cameras: Camera,
+    vertices: Float[Array, "v n 3"],
+    normals: Float[Array, "v n 3"],
+    distances: tuple[float, ...],
+    present: Bool[Array, " v"],
+    grid: PixelGrid,
+) -> Shells:
+    """Sample every view that is `present` at the points at `distances` from the posed vertices.
+
+    images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the body, -1 on background.
+    cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending, normalised units.
+    """
+    steps = jnp.asarray(distances, vertices.dtype)
+    count = vertices.shape[1]
+    size = (images.shape[2], images.shape[1])
+
+    def view(image, mask, depth_map, camera, vertices, normals):
+        points = (vertices[:, None] + steps[:, None] * normals[:, None]).reshape(-1, 3)
+        pixels, depths = project_vertices(camera, points)
+        indices = texel_indices(pixels, size, size, grid)
+        mask = mask[..., None].astype(image.dtype)  # the color of the background is not used
+        read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
+        surface = sample_nearest(depth_map, indices)
+        framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
+        visible = framed & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE))
+        towards = camera.center - points
+        distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), SQUARED_DISTANCE_EPSILON))
+        facing = jnp.sum(towards * jnp.repeat(normals, len(distances), axis=0), axis=-1) / distance
+        weight = jnp.where(visible, jnp.maximum(facing, 0), 0)
+        return read[:, :3], read[:, 3], weight, framed
+
+    colors, masks, weights, framed = jax.vmap(view)(images, foreground, depth_maps, cameras, vertices, normals)
+    framed, weights = framed & present[:, None], weights * present[:, None]
+    total = jnp.sum(weights * masks, axis=0)
+    mean = jnp.einsum("vpc,vp->pc", colors, weights) / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
+    known = jnp.sum(framed, axis=0)
+    inside = jnp.where(known > 0, jnp.sum(masks * framed, axis=0) / jnp.maximum(known, 1), 1)
+    by_vertex = lambda x: x.reshape(count, len(distances), *x.shape[1:])
+    return Shells(
+        distances=steps,
+        colors=by_vertex(jnp.where((total > WEIGHT_EPSILON)[:, None], mean, UNSEEN_COLOR)),
+        seen=by_vertex(total / jnp.maximum(jnp.sum(present), 1)),
+        inside=by_vertex(inside),
+        hull=by_vertex(jnp.min(jnp.where(framed, masks, 1), axis=0)),
+    )

@@ -31,6 +31,8 @@ from humangs_jax.network.runtime import AttentionKernel, Runtime
 NORM_EPSILON = 1e-5
 PRODUCT = "product"
 """Name of the arrays of a block that `Runtime.remat` "dots" may keep for the backward pass."""
+QUERIES = 1024
+"""At once, in "chunked"."""
 XLA_TOKENS = 8192
 """Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
 
@@ -51,7 +53,7 @@ def chunked_attention(
     k: Float[Array, "l h e"],
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None,
-    query_chunk: int,
+    query_chunk: int = QUERIES,
 ) -> Float[Array, "m h e"]:
     """Exact attention, head by head and one block of queries after the other; softmax statistics in float32 at least."""
     length, heads, width = q.shape
@@ -86,12 +88,11 @@ def attention(
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None = None,
     implementation: str = "auto",
-    query_chunk: int = 1024,
 ) -> Float[Array, "m h e"]:
     """Attention of every query to the first `count` tokens (None: to all)."""
     resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
     if resolved == "chunked":
-        return chunked_attention(q, k, v, count, query_chunk)
+        return chunked_attention(q, k, v, count)
     lengths = None if count is None else count.astype(jnp.int32)[None]
     out = jax.nn.dot_product_attention(
         q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
@@ -120,7 +121,7 @@ class Attention(nn.Module):
         if self.qk_norm:
             q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="q_norm")(q)
             k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="k_norm")(k)
-        out = attention(q, k, v, count, self.runtime.attention, self.runtime.attention_chunk)
+        out = attention(q, k, v, count, self.runtime.attention)
         out = checkpoint_name(out, PRODUCT)
         return dense(width, "out")(out.reshape(length, width))
 
@@ -131,18 +132,20 @@ _POLICIES = {"full": None, "dots": jax.checkpoint_policies.save_only_these_names
 
 @configuration
 class TransformerConfig:
-    """Sizes of the transformer.
-
-    width: features per token. layers: blocks. mlp_ratio: hidden width of the MLP over the width. class_token: a learned global
-    token in front of all others. head_width: features per attention head. qk_norm: RMSNorm over the head on q and k.
-    """
+    """Sizes of the transformer."""
 
     width: Width = 768
+    """Features per token."""
     layers: Layers = 12
+    """Blocks."""
     mlp_ratio: Ratio = 4
+    """Hidden width of the MLP over the width."""
     class_token: bool = True
+    """A learned global token in front of all others."""
     head_width: Width = 64
+    """Features per attention head."""
     qk_norm: bool = True
+    """RMSNorm over the head on q and k."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -162,11 +165,6 @@ class Block(nn.Module):
     runtime: Runtime
     index: int
 
-    @property
-    def stage_name(self) -> str:
-        """Name of this block in a diagnosis."""
-        return f"block {self.index}"
-
     @nn.compact
     def __call__(self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
         config, dtype = self.config, self.runtime.compute_dtype
@@ -184,8 +182,6 @@ class Transformer(nn.Module):
 
     config: TransformerConfig
     runtime: Runtime
-
-    stage_names = {"input_norm": "input norm", "norm": "final norm"}  # noqa: RUF012 (Linen would take a ClassVar for a field)
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> list[Float[Array, "l d"]]:

@@ -5,8 +5,7 @@ convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolut
 bare). Maps are (v, h, w, c).
 
 The last convolution is half of that arithmetic, and only body vertices read what it computes, from positions between
-its pixels. So it is a module of its own, `OutputConvolution`, that the reader applies to what the vertices have read of
-its input.
+its pixels. So the reader applies it to what the vertices have read of its input.
 """
 
 from typing import Annotated, Any, Literal
@@ -18,8 +17,7 @@ from flax.linen.dtypes import promote_dtype
 
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.configuration import Range, configuration
-from humangs_jax.network.bilinear import KERNEL
-from humangs_jax.network.convolution import Convolution
+from humangs_jax.network.maps import Convolution
 
 SLOPE = 0.2
 MOMENTUM = 0.9
@@ -31,10 +29,12 @@ KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
 
 @configuration
 class UpsamplerConfig:
-    """hidden: width, see the module. features: "intermediate" aggregates four depths, "final" upsamples the last (ablation)."""
+    """See the module."""
 
     hidden: Annotated[int, Range(2, 16_384)] = 256
+    """Width."""
     features: Literal["intermediate", "final"] = "intermediate"
+    """All four depths are aggregated ("intermediate"), or the last is upsampled alone ("final", an ablation)."""
 
 
 class UpConvolution(nn.Module):
@@ -67,41 +67,11 @@ class UpConvolution(nn.Module):
         return y.reshape(views, 2 * height, 2 * width, self.features) + bias
 
 
-class OutputConvolution(nn.Module):
-    """The last convolution, 3x3: (n, 9 c) neighbourhoods and (n,) coverages, pooled over views -> (n, features).
-
-    See `network.bilinear`. `everywhere` convolves a map instead; it is for looking at maps.
-    """
-
-    features: int
-    channels: int
-    dtype: Any = None
-
-    def setup(self):
-        """Parameters of a 3x3 convolution."""
-        self.kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, self.channels, self.features))
-        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
-
-    def __call__(self, neighborhoods: Float[Array, "n k"], coverages: Float[Array, " n"]) -> Float[Array, "n d"]:
-        """Features of positions, in the dtype of the coverages."""
-        x, kernel = promote_dtype(neighborhoods, self.kernel, dtype=self.dtype)
-        kernel = kernel.reshape(-1, self.features)
-        return jnp.matmul(x, kernel, preferred_element_type=coverages.dtype) + coverages[:, None] * self.bias
-
-    def everywhere(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:
-        """Features of every pixel."""
-        x, kernel, bias = promote_dtype(x, self.kernel, self.bias, dtype=self.dtype)
-        layout = ("NHWC", "HWIO", "NHWC")
-        return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=layout) + bias
-
-
 class Upsampler(nn.Module):
-    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of `OutputConvolution`.
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of the last convolution.
 
     axis_name: vmap axis to share batch statistics over.
     """
-
-    stage_name = "maps"
 
     config: UpsamplerConfig
     dtype: Any = None

@@ -5,22 +5,21 @@ photo color, the fraction of views that see it, and what the photos show at dist
 `tight` Gaussians of a vertex are those whose offsets a loss keeps small.
 """
 
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import Bias, Few, Range, Spread, Width, knob, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Shells, Variables, VertexFeatures
-from humangs_jax.network.pixel_aligned import on_the_person
+from humangs_jax.network.parts import Decoder, HumanGSInputs, HumanGSOutputs, Pass, VertexFeatures, subject_unit
+from humangs_jax.network.reader import on_the_person
 from humangs_jax.rendering.gaussians import Gaussians
 
 FREQUENCIES = (1, 2, 4, 8, 16, 32)
@@ -41,31 +40,36 @@ INITIAL_SHELL = 4.0
 
 
 @part
-class VertexDecoder:
+class VertexDecoder(Decoder):
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
-    hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
-
-    skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are
-    bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published.
-    initial_log_scale: initial bias of the scales, before the softplus. frame: axes of offsets and rotations, "canonical"
-    those of the canonical body (published), "normal" ones whose z is the vertex's normal, along which Gaussians start
-    `THINNER`. residual_color: colors are predicted relative to the photo color.
+    It computes in float32 at least: it is a thousandth of the published network's arithmetic, and bfloat16 here would double the
+    error of its Gaussians.
     """
 
     hidden: Width = 256
+    """Width."""
     tight: Annotated[int, Range(0, 256)] = 1
+    """Gaussians per vertex whose offsets a loss keeps small; K = tight + free."""
     free: Annotated[int, Range(0, 256)] = knob(
         4, cost="detail: K = tight + free", gain="drawing in proportion to K", measured="evaluation.md"
     )
+    """Gaussians per vertex without such a loss."""
     skinning_joints: Few | None = None
+    """Joints of the head that corrects skinning weights, None without it."""
     offset_scale: Spread | None = None
+    """Offsets are bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published."""
     initial_log_scale: Bias = -3.0
+    """Initial bias of the scales, before the softplus."""
     frame: Literal["canonical", "normal"] = "canonical"
+    """Axes of offsets and rotations: those of the canonical body (published), or ones whose z is the vertex's normal, along which
+    Gaussians start `THINNER`."""
     residual_color: bool = False
+    """Colors are predicted relative to the photo color."""
 
     def __post_init__(self):
         """Raises ValueError without a Gaussian."""
+        super().__post_init__()
         if self.gaussians_per_vertex < 1:
             raise ValueError("decoder: tight + free must be at least 1")
 
@@ -74,66 +78,59 @@ class VertexDecoder:
         """K."""
         return self.tight + self.free
 
-    def init(self, key: Key, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of `DecoderModule`."""
-        entering = jax.eval_shape(self._entering, features, inputs)
-        return cast(Variables, self._module(features).init(key, jnp.zeros((1, entering.shape[-1]))))
-
-    def apply(self, variables: Variables, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+    @nn.compact
+    def __call__(self, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """Gaussians of the n vertices, vertex-major, metres. Raises ValueError for features that lack the normals."""
-        unit = subject_unit(inputs.canonical_vertices)
-        canonical = inputs.canonical_vertices / unit
-
-        def heads(learned):
-            entering = self._entering(replace(features, **learned), inputs)
-            return cast(RawGaussians, self._module(features).apply(variables, entering))
-
-        # where the body is wider than the person, all photos show the background
-        drop = run.conventions.pixels == "person" and features.shells is not None
-        raw = run.stage("raw heads", heads, {"local": features.local, "global_token": features.global_token})
-        return run.stage(
-            "canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit, inputs.spacing, drop), raw
-        )
-
-    def _module(self, features: VertexFeatures):
-        return DecoderModule(self, 0 if features.shells is None else features.shells.distances.shape[0])
-
-    def _entering(self, features: VertexFeatures, inputs: HumanGSInputs) -> Float[Array, "n c"]:
         if self.frame == "normal" and features.normals is None:
             raise ValueError('decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`')
-        features = features if self.frame == "normal" else replace(features, normals=None)
-        return decoder_input(features, inputs.canonical_vertices / subject_unit(inputs.canonical_vertices))
-
-    def _assemble(
-        self,
-        raw: "RawGaussians",
-        features: VertexFeatures,
-        canonical: Array,
-        unit: Array,
-        spacing: Array | None,
-        drop: bool,
-    ) -> HumanGSOutputs:
-        at_vertices = activate(raw, self, features)
-        if drop:
-            kept = on_the_person(cast(Shells, features.shells))[:, None]
-            at_vertices = replace(at_vertices, opacities=jnp.where(kept, at_vertices.opacities, 0.0))
-        if spacing is not None:
-            at_vertices = replace(at_vertices, scales=at_vertices.scales * spacing[:, None, None])
+        unit, shells = subject_unit(inputs.canonical_vertices), features.shells
+        canonical = inputs.canonical_vertices / unit
+        entering = features if self.frame == "normal" else replace(features, normals=None)
+        raw = self._heads(decoder_input(entering, canonical), 0 if shells is None else len(shells.distances))
+        made = activate(raw, self, features)
+        if run.conventions.pixels == "person" and shells is not None:
+            # where the body is wider than the person, all photos show the background
+            kept = on_the_person(shells)[:, None]
+            made = replace(made, opacities=jnp.where(kept, made.opacities, 0.0))
+        if inputs.spacing is not None:
+            made = replace(made, scales=made.scales * inputs.spacing[:, None, None])
         flat = lambda x: x.reshape(-1, *x.shape[2:])
+        gaussians = Gaussians(
+            means=flat(canonical[:, None] + made.offsets) * unit,
+            quats=flat(made.quats),
+            scales=flat(made.scales) * unit,
+            opacities=flat(made.opacities),
+            colors=flat(made.colors),
+        )
         return HumanGSOutputs(
-            gaussians=Gaussians(
-                means=flat(canonical[:, None] + at_vertices.offsets) * unit,
-                quats=flat(at_vertices.quats),
-                scales=flat(at_vertices.scales) * unit,
-                opacities=flat(at_vertices.opacities),
-                colors=flat(at_vertices.colors),
-            ),
-            tight_offsets=at_vertices.offsets[:, : self.tight],
+            gaussians,
+            tight_offsets=made.offsets[:, : self.tight],
             shell_spread=None if raw.shells is None else shell_spread(raw.shells, features),
             skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
-            dropped_tokens=jnp.zeros((), jnp.int32),
-            dropped_reads=jnp.zeros((), jnp.int32) if features.dropped_reads is None else features.dropped_reads,
         )
+
+    def _heads(self, x: Float[Array, "n c"], shells: int) -> "RawGaussians":
+        k = self.gaussians_per_vertex
+
+        def hidden_layer(x, name):
+            return jax.nn.relu(nn.Dense(self.hidden, kernel_init=nn.initializers.normal(INIT_STD), name=name)(x))
+
+        def head(x, name, bias, kernel_init):
+            bias_init = lambda key, shape, dtype=jnp.float32: jnp.tile(jnp.asarray(bias, dtype), k)
+            last = nn.Dense(k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out")
+            return last(hidden_layer(x, f"{name}_hidden")).reshape(x.shape[0], k, len(bias))
+
+        x = hidden_layer(hidden_layer(x, "trunk_0"), "trunk_1")
+        small = nn.initializers.normal(LAST_STD)
+        thin = THINNER if self.frame == "normal" else 0.0
+        scales = [self.initial_log_scale] * 2 + [self.initial_log_scale - thin]
+        joints, chosen = None, None
+        if self.skinning_joints is not None:
+            joints = head(x, "skinning", [0.0] * self.skinning_joints, nn.initializers.zeros)
+        if shells:
+            chosen = head(x, "shells", [INITIAL_SHELL] + [0.0] * (shells - 1), small)
+        geometry = head(x, "geometry", [0.0] * 3 + list(quaternion.IDENTITY) + scales, small)
+        return RawGaussians(geometry, head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small), joints, chosen)
 
 
 @pytree_dataclass
@@ -246,44 +243,3 @@ def corrected_skinning_weights(
     if offsets is None:
         return weights
     return jax.nn.softmax(jnp.log(weights + WEIGHT_EPSILON) + offsets, axis=-1)
-
-
-class DecoderModule(nn.Module):
-    """Decoder inputs (n, c) -> raw heads, in float32 at least.
-
-    That is a thousandth of the published network's arithmetic, and bfloat16 here would double the error of its
-    Gaussians.
-    """
-
-    config: VertexDecoder
-    shells: int = 0
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "n c"]) -> RawGaussians:
-        config, k = self.config, self.config.gaussians_per_vertex
-
-        def hidden_layer(x, name):
-            return jax.nn.relu(nn.Dense(config.hidden, kernel_init=nn.initializers.normal(INIT_STD), name=name)(x))
-
-        def head(x, name, bias, kernel_init):
-            bias_init = lambda key, shape, dtype=jnp.float32: jnp.tile(jnp.asarray(bias, dtype), k)
-            last = nn.Dense(k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out")
-            return last(hidden_layer(x, f"{name}_hidden")).reshape(x.shape[0], k, len(bias))
-
-        x = hidden_layer(hidden_layer(x, "trunk_0"), "trunk_1")
-        small = nn.initializers.normal(LAST_STD)
-        geometry = [0.0] * 3 + list(quaternion.IDENTITY) + [config.initial_log_scale] * 3
-        if config.frame == "normal":
-            geometry[-1] -= THINNER
-        skinning = None
-        if config.skinning_joints is not None:
-            skinning = head(x, "skinning", [0.0] * config.skinning_joints, nn.initializers.zeros)
-        shells = None
-        if self.shells:
-            shells = head(x, "shells", [INITIAL_SHELL] + [0.0] * (self.shells - 1), small)
-        return RawGaussians(
-            head(x, "geometry", geometry, small),
-            head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small),
-            skinning,
-            shells,
-        )

@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import json
 import logging
-import shutil
 import zlib
 from collections.abc import Generator
 from pathlib import Path
@@ -62,7 +61,7 @@ class Checkpoints:
         if unreadable := _without_score(folder):
             if read_only:
                 raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
-            _set_aside(_not_being_deleted(folder, unreadable, keep))
+            _set_aside(unreadable)
         logging.getLogger("absl").addFilter(_not_of_orbax)
         self._manager = ocp.CheckpointManager(folder, options=options)
 
@@ -150,11 +149,8 @@ class Checkpoints:
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
         if state is not None and recorded != (found := _checksum(state)):
             state, problem = None, f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"
-        if jax.process_count() > 1:
-            from jax.experimental import multihost_utils
-
-            if not multihost_utils.process_allgather(np.asarray(state is not None)).all():
-                state, problem = None, problem or f"{path}: damaged, as another process found"
+        if not _everywhere(state is not None).all():
+            state, problem = None, problem or f"{path}: damaged, as another process found"
         return state, problem
 
     def close(self) -> None:
@@ -167,6 +163,15 @@ CHECKSUM = "checksum"
 """Beside the score of a checkpoint."""
 
 
+def _everywhere(value: Any) -> np.ndarray:
+    """Values of all processes, one after the other."""
+    if jax.process_count() == 1:
+        return np.asarray(value)[None]
+    from jax.experimental import multihost_utils
+
+    return np.asarray(multihost_utils.process_allgather(np.asarray(value)))
+
+
 def _checksum(state: TrainState) -> str:
     """64 bits, in hexadecimal, of all arrays: the sum of their words, each times an odd number that depends on its place.
 
@@ -174,17 +179,11 @@ def _checksum(state: TrainState) -> str:
     """
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):
-        of_leaf = zlib.crc32(jax.tree_util.keystr(path).encode()) | 1
-        total += of_leaf * sum(
-            _weighted_sum(shard, leaf.shape) for shard in leaf.addressable_shards if shard.replica_id == 0
-        )
+        own = [_weighted_sum(shard, leaf.shape) for shard in leaf.addressable_shards if shard.replica_id == 0]
+        total += (zlib.crc32(jax.tree_util.keystr(path).encode()) | 1) * sum(own)
     total %= 1 << 64
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
-        halves = np.asarray([total >> 32, total & 0xFFFFFFFF], np.uint32)
-        total = sum((int(high) << 32) + int(low) for high, low in multihost_utils.process_allgather(halves)) % (1 << 64)
-    return f"{total:016x}"
+    halves = _everywhere(np.asarray([total >> 32, total & 0xFFFFFFFF], np.uint32))
+    return f"{sum((int(high) << 32) + int(low) for high, low in halves) % (1 << 64):016x}"
 
 
 def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
@@ -213,33 +212,14 @@ def _without_score(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _not_being_deleted(folder: Path, unreadable: list[Path], keep: int) -> list[Path]:
-    """Those that were not being deleted when the run was killed: fewer than `keep` newer ones exist.
-
-    The others are deleted; without a score none of them is the best one.
-    """
-    steps = [int(path.name) for path in folder.glob("[0-9]*") if path.name.isdecimal() and path not in unreadable]
-    deleted = [path for path in unreadable if sum(step > int(path.name) for step in steps) >= keep]
-    for path in deleted if jax.process_index() == 0 else ():
-        shutil.rmtree(path, ignore_errors=True)
-    return [path for path in unreadable if path not in deleted]
-
-
 def _set_aside(steps: list[Path]) -> None:
     """Rename damaged checkpoints, so that their steps can be saved again; nothing is deleted."""
-    if jax.process_index() == 0:
-        for step in steps:
-            aside = next(
-                p
-                for i in range(1 << 30)
-                if not (p := step.with_name(f"damaged-{step.name}" + f"-{i}" * (i > 0))).exists()
-            )
-            step.rename(aside)
-            logger.warning("%s: a damaged checkpoint, set aside as %s", step, aside.name)
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
-        multihost_utils.sync_global_devices("damaged checkpoints are set aside")
+    for step in steps if jax.process_index() == 0 else ():
+        numbers = ("", *(f"-{i}" for i in range(1, 1000)))
+        aside = next(p for i in numbers if not (p := step.with_name(f"damaged-{step.name}{i}")).exists())
+        step.rename(aside)
+        logger.warning("%s: a damaged checkpoint, set aside as %s", step, aside.name)
+    _everywhere(0)  # all processes wait for it
 
 
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import logging
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from humangs_jax.core.configuration import (
     Few,
@@ -15,23 +15,23 @@ from humangs_jax.core.configuration import (
     Seed,
     Share,
     Side,
+    Spread,
     Steps,
-    Weight,
     configuration,
     knob,
 )
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.io.reading import read_configuration
 from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.losses import LossConfig
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.augmentation import Augmentation
-from humangs_jax.training.optimizer import OptimizerConfig
 
 logger = logging.getLogger(__name__)
-
-
+Below = Annotated[float, Range(0, 0.999_999)]
+"""Of a running mean that forgets."""
 HOST_SETTINGS = {
     "seed": 0,
     "log_every": 1,
@@ -43,36 +43,22 @@ HOST_SETTINGS = {
 
 
 @configuration
-class LossConfig:
-    """Weights of the terms, each a mean over pixels or vertices and over the targets.
+class OptimizerConfig:
+    """Of `state.make_optimizer`."""
 
-    squared: error of the colors. structural: structural dissimilarity at `structural_scales` sizes. silhouette:
-    squared error of the coverage. tightness: squared tight offsets, normalised units. perceptual: difference of the
-    features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
-    `losses.loss_networks`.
-
-    Against semi-transparent foreground, which squared errors cause where the network is in doubt: absolute, boundary: absolute
-    errors of colors and of coverage. depth: distance between the surfaces seen, metres; 0 for people on disk, whose depths are
-    unknown. distortion: spread of the weights along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the
-    distances that a Gaussian mixes, normalised units. Perceptual terms and those against semi-transparent foreground are
-    computed only where their weight is not 0. random_background: share of the targets that are seen against one random color
-    instead of white, so that white Gaussians differ from missing ones.
-    """
-
-    squared: Weight = 1.0
-    structural: Weight = 0.2
-    structural_scales: Annotated[int, Range(1, 16)] = 3
-    silhouette: Weight = 0.1
-    tightness: Weight = 0.1
-    perceptual: Weight = 0.0
-    lpips: Weight = 0.0
-    absolute: Weight = 0.0
-    boundary: Weight = 0.0
-    depth: Weight = 0.0
-    distortion: Weight = 0.0
-    opaque: Weight = 0.0
-    shells: Weight = 0.0
-    random_background: Share = 0.5
+    name: Literal["adamw", "nadamw", "lamb", "lion"] = "adamw"
+    """Of `optax`."""
+    learning_rate: Spread = 4e-4
+    """The peak, reached after `warmup_steps` from 0, then a cosine to 0 at the end of the run."""
+    warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
+    betas: tuple[Below, Below] = (0.9, 0.95)
+    """Of the running means of gradients and of their squares."""
+    weight_decay: Spread = 0.05
+    """It acts on parameters with two or more axes (products, textures, the class token)."""
+    clip_norm: Annotated[float, Range(0, 1e12)] = 1.0
+    """Gradients longer than this are scaled down to it."""
+    skip_norm: Annotated[float, Range(0, 1e12)] = 100.0
+    """Above it the step is skipped."""
 
 
 @configuration
@@ -88,37 +74,39 @@ class Stage:
 
 @configuration
 class TrainConfig:
-    """One run. Photos enter at `model.conventions.image_size` pixels, targets are learned at `target_size`.
-
-    steps: of the whole run, which the learning rate ends with. stages: in the order of their starts, for instance larger
-    photos for the last steps. Before the first stage the fields here hold, see `at`.
-    batch_size: subjects per step. microbatch_size: of those of a device, how many it works on at once, gradients
-    accumulating over the rest: 1 needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects
-    that all devices work on at once. ema_decay: of the averaged parameters, None for none.
-    log_every, validate_every, checkpoint_every: steps. keep_checkpoints: newest checkpoints to keep, besides the best.
+    """One run. Photos enter at `model.conventions.image_size` pixels.
 
     Raises: ValueError for stages that are not in order, or sizes that do not divide each other.
     """
 
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
-    views: ViewSampling = dataclasses.field(default_factory=ViewSampling)
-    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
-    augmentation: Augmentation = dataclasses.field(default_factory=Augmentation)
-    optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
-    splat: SplatConfig = dataclasses.field(default_factory=SplatConfig)
+    views: ViewSampling = ViewSampling()
+    loss: LossConfig = LossConfig()
+    augmentation: Augmentation = Augmentation()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    splat: SplatConfig = SplatConfig()
     target_size: Side = 128
+    """Side of the targets, pixels."""
     steps: Steps = 20_000
+    """Of the whole run, which the learning rate ends with."""
     batch_size: Few = 1
+    """Subjects per step."""
     microbatch_size: Few = knob(
         1, cost="memory in proportion", gain="fewer, larger steps on accelerators", measured="performance.md"
     )
+    """How many subjects of a device it works on at once, gradients accumulating over the rest: 1 needs least memory and suits
+    CPUs. The upsampler's batch statistics are of the subjects that all devices work on at once."""
     stages: tuple[Stage, ...] = ()
+    """In the order of their starts, for instance larger photos for the last steps. Before the first one the fields here hold."""
     ema_decay: Share | None = None
+    """Of the averaged parameters, None for none."""
     seed: Seed = 0
     log_every: Steps = 20
+    """Steps, as the following."""
     validate_every: Steps = 1000
     checkpoint_every: Steps = 1000
     keep_checkpoints: Steps = 2
+    """Newest checkpoints to keep, besides the best."""
 
     def __post_init__(self):
         if self.model.runtime.dtype == "float16":
@@ -240,15 +228,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     path = Path(preset_or_path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
-    try:
-        return read_configuration(TrainConfig, path)
-    except ValueError as error:
-        if "HumanGSConfig has no such field" not in str(error):
-            raise
-        raise ValueError(
-            f"{error}: expected architecture, conventions and runtime. A run of a version before `model` was divided so "
-            "cannot be continued: start another one from its weights.safetensors in another folder"
-        ) from error
+    return read_configuration(TrainConfig, path)
 
 
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:

@@ -3,56 +3,255 @@
     print(diagnose_step(state, batch, body, config))       # one step
     print(diagnose_run("runs/small", load_body(), people)) # the first step of a run that failed
 
+Stages are the modules of the network, by their path, and the steps beside it that are a `parts.stage`. An interceptor of Linen
+keeps what they return, and adds zeros to what they take and return: the gradients with respect to these zeros are those that pass
+back there.
+
 For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu helps where an
 accelerator has too little.
 """
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Key, PyTree, Scalar
 from humangs_jax.core.progress import bar, watched
-from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.pytree import inexact_leaves, pytree_dataclass, static_field
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.reading import parse_json, read_text, reading
-from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.network.parts import Variables
-from humangs_jax.network.stages import Named, Recorder, inexact_leaves
+from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
+from humangs_jax.network.parts import HumanGSInputs, Variables, Watched
 from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
 from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, seed_numbers, subject_keys, subject_loss, train_step
+from humangs_jax.training.step import seed_numbers, subject_keys, subject_loss, train_step
 
+T = TypeVar("T")
+Named = dict[str, Any]
+"""Arrays, or `Leaf`s of them, by their paths in a pytree; "" for a bare array."""
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
+PARTS, DEEPEST = (("encoder",), ("reader",), ("decoder",)), 3
+"""Modules of these are stages, down to this depth: encoder.transformer.block_0."""
 
 
-NEAREST = {
-    "encoder": ("encoding",),
-    "reader": ("vertex features",),
-    "decoder": ("posed Gaussians", "images"),
-    "driver": ("posed Gaussians",),
-}
-"""Stages for the parameters of parts that have no stages of their own: the first that the network has."""
+@dataclasses.dataclass(frozen=True)
+class Leaf:
+    """Numbers of one array. bad: entries that are not finite, the first of them at index `first`. Of the finite entries:
+    smallest and largest (+-inf without any), the mean of their magnitudes, their Euclidean norm.
+    """
+
+    name: str
+    bad: int
+    first: tuple[int, ...]
+    smallest: float
+    largest: float
+    mean: float
+    norm: float
+
+    @classmethod
+    def of(cls, name: str, array: np.ndarray) -> "Leaf":
+        """The numbers of an array."""
+        wrong = ~np.isfinite(array.astype(np.promote_types(array.dtype, np.float32), copy=False))
+        bad = int(np.count_nonzero(wrong))
+        finite = (array[~wrong] if bad else array.reshape(-1)).astype(np.float64)
+        return cls(
+            name=name,
+            bad=bad,
+            first=tuple(int(i) for i in np.unravel_index(int(np.argmax(wrong)), array.shape)) if bad else (),
+            smallest=float(np.min(finite, initial=np.inf)),
+            largest=float(np.max(finite, initial=-np.inf)),
+            mean=float(np.mean(np.abs(finite))) if finite.size else 0.0,
+            norm=float(np.linalg.norm(finite)),
+        )
 
 
 @pytree_dataclass
-class ObservedStage:
-    """values: what a stage gives. cotangents: the gradients that it sends back to what it takes. gradients: of its parameters."""
+class StageReport:
+    """values: what a stage gave (or what was stored there). taken, returned: gradients at what it took and gave. gradients: those
+    of its parameters. Arrays by name, or `Leaf`s of them.
+    """
 
     name: str = static_field()
     values: Named
-    cotangents: Named
-    gradients: Named
+    taken: Named = dataclasses.field(default_factory=dict)
+    returned: Named = dataclasses.field(default_factory=dict)
+    gradients: Named = dataclasses.field(default_factory=dict)
+
+    @property
+    def gradient_norm(self) -> float:
+        """Euclidean norm of the gradients of its parameters."""
+        return math.hypot(*(leaf.norm for leaf in self.gradients.values()))
+
+    @property
+    def spoils(self) -> Leaf | None:
+        """A gradient that is not finite although all that came back to this stage are."""
+        if _first_bad(self.returned):
+            return None
+        return _first_bad(self.gradients) or _first_bad(self.taken)
+
+
+def _first_bad(leaves: dict[str, Leaf]) -> Leaf | None:
+    return next((leaf for leaf in leaves.values() if leaf.bad), None)
+
+
+def stored_report(name: str, tree: PyTree) -> StageReport:
+    """Of the arrays of a state or a batch."""
+    return numbers(StageReport(name, dict(inexact_leaves(tree))))
+
+
+def numbers(report: StageReport) -> StageReport:
+    """A report of arrays as one of `Leaf`s."""
+    of = lambda arrays: {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
+    return StageReport(report.name, *map(of, (report.values, report.taken, report.returned, report.gradients)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """An array that is not finite: stored so (in the state or the batch), computed by a stage, or sent back by it."""
+
+    direction: Literal["stored", "forward", "backward"]
+    stage: str
+    leaf: Leaf
+
+    def __str__(self) -> str:
+        what = {
+            "stored": f"in the {self.stage}",
+            "forward": f"first computed by stage '{self.stage}'",
+            "backward": f"first in a gradient sent back by stage '{self.stage}'",
+        }[self.direction]
+        place = list(self.leaf.first)
+        return f"not finite {what}: {self.leaf.name or 'its value'}, {self.leaf.bad} entries, first at {place}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """The diagnosis of one subject of a step: the first with a fault, or else the one with the largest gradient.
+
+    step: steps done before it. stored: what the step began with, state and batch. stages: in the order in which they end.
+    skip_norm: gradients longer than this are skipped. `str` of it is a report.
+    """
+
+    step: int
+    subject: int
+    loss: float
+    skip_norm: float
+    stored: tuple[StageReport, ...]
+    stages: tuple[StageReport, ...]
+
+    @property
+    def gradient_norm(self) -> float:
+        """Euclidean norm of the finite part of this subject's gradient."""
+        return math.hypot(*(stage.gradient_norm for stage in self.stages))
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """All that was stored and is not finite; then the first stage to blame, going forward or else going back."""
+        stored = [Fault("stored", part.name, leaf) for part in self.stored for leaf in part.values.values() if leaf.bad]
+        return (*stored, *self._computed())
+
+    def _computed(self) -> list[Fault]:
+        for stage in self.stages:
+            if leaf := _first_bad(stage.values):
+                return [Fault("forward", stage.name, leaf)]
+        found = [stage for stage in self.stages if stage.spoils]
+        inner = [stage for stage in found if not any(other.name.startswith(f"{stage.name}.") for other in found)]
+        return [Fault("backward", stage.name, stage.spoils) for stage in inner[-1:] if stage.spoils]
+
+    @property
+    def fault(self) -> Fault | None:
+        """Where it began, None if all is finite."""
+        return next(iter(self.faults), None)
+
+    @property
+    def verdict(self) -> str:
+        """What was found, in one line or a few."""
+        if self.faults:
+            return "\n".join(map(str, self.faults))
+        norm = self.gradient_norm
+        if norm <= self.skip_norm:
+            return f"all finite; gradient norm {norm:.3g} (a step is skipped above {self.skip_norm:g})"
+        worst = max(self.stages, key=lambda stage: stage.gradient_norm)
+        return (
+            f"all finite, but the gradient norm {norm:.3g} is above {self.skip_norm:g}, where a step is skipped; "
+            f"{(worst.gradient_norm / norm) ** 2:.0%} of its square is of stage '{worst.name}'"
+        )
+
+    def __str__(self) -> str:
+        title = (
+            f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
+        )
+        rows = [
+            ("stage", "values: bad", "smallest", "largest", "mean |x|", "sent back: bad", "parameters: bad", "norm")
+        ]
+        for report in (*self.stored, *self.stages):
+            values, sent, own = (list(x.values()) for x in (report.values, report.taken, report.gradients))
+            bad = lambda leaves: str(sum(leaf.bad for leaf in leaves)) if leaves else ""
+            of = lambda combine, field, leaves=values: (
+                f"{combine([getattr(leaf, field) for leaf in leaves]):.3g}" if leaves else ""
+            )
+            numbers = of(min, "smallest"), of(max, "largest"), of(np.mean, "mean")
+            norm = f"{report.gradient_norm:.3g}" if own else ""
+            rows.append((report.name, bad(values), *numbers, bad(sent), bad(own), norm))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        align = lambda row: [row[0].ljust(widths[0]), *(x.rjust(w) for x, w in zip(row[1:], widths[1:], strict=True))]
+        return "\n".join([title, self.verdict, "", *("  ".join(align(row)).rstrip() for row in rows)])
+
+
+class Recorder:
+    """An interceptor for `nn.intercept_methods` that records the stages of one traced computation, in the order of their ends.
+
+    given: {stage: what it returned}. probes: {stage: (zeros added to what it takes, to what it returns)}; None in a first run,
+    which finds their `shapes`.
+    """
+
+    def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):
+        self.given: dict[str, Named] = {}
+        self.shapes: dict[str, tuple[Named, Named]] = {}
+        self._probes = probes
+
+    def __call__(self, run: Callable, arguments: tuple, named: dict, context: nn.module.InterceptorContext) -> Any:
+        """Run a method, watched if it is a stage."""
+        module, (first, *others) = context.module, arguments
+        if isinstance(module, Watched):
+            if not module.apart:
+                return self.watch(str(module.name), *arguments)
+            entry = lambda key: lambda *learned: first(*learned)[key]
+            names = jax.eval_shape(lambda: first(*others))
+            return {key: self.watch(f"{module.name}: {key}", entry(key), *others) for key in names}
+        path = ".".join(module.path)
+        if context.method_name != "__call__" or module.path[:1] not in PARTS or len(module.path) > DEEPEST:
+            return run(*arguments, **named)
+        if isinstance(first, HumanGSInputs):  # nothing of it depends on parameters
+            return self.watch(path, lambda: run(*arguments, **named))
+        return self.watch(path, lambda first: run(first, *others, **named), first)
+
+    def watch(self, stage: str, function: Callable, *learned: Any) -> Any:
+        """function(*learned), recorded."""
+        result = self._probed(stage, 1, function(*self._probed(stage, 0, learned)))
+        self.given[stage] = dict(inexact_leaves(result))
+        return result
+
+    def _probed(self, stage: str, side: int, tree: T) -> T:
+        leaves = dict(inexact_leaves(tree))
+        if self._probes is None:
+            self.shapes.setdefault(stage, ({}, {}))[side].update(jax.eval_shape(lambda: leaves))
+            return tree
+        sums = [x + self._probes[stage][side][name] for name, x in leaves.items()]
+        floating = lambda x: hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.inexact)
+        return jax.tree.map(lambda x: sums.pop(0) if floating(x) else x, tree)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -64,8 +263,8 @@ def observe_subject(
     key: Key,
     config: TrainConfig,
     networks: LossNetworks,
-) -> tuple[Scalar, list[ObservedStage]]:
-    """The loss (`subject_loss`), and all its stages in the order of the forward pass.
+) -> tuple[Scalar, list[StageReport]]:
+    """The loss (`subject_loss`), and all its stages in the order in which they end.
 
     Blocks are neither looped over nor recomputed, so that each can be watched, and everything is kept: this needs more
     memory than a step (the published network at 512 pixels, 4 views each: 2.4 GB are kept).
@@ -74,30 +273,21 @@ def observe_subject(
 
     def loss(params, probes, recorder):
         recorder = recorder or Recorder(probes)
-        with nn.intercept_methods(recorder.watch):
-            value, _ = subject_loss(params, batch_stats, body, example, key, config, networks, stage=recorder)
-        return value, recorder.given
+        with nn.intercept_methods(recorder):
+            value, _ = subject_loss(params, batch_stats, body, example, key, config, networks)
+        return value, recorder.given | {"loss": {"": value}}
 
     dry = Recorder()  # finds the stages and their shapes
     jax.eval_shape(lambda params: loss(params, None, dry)[0], params)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), dry.shapes)
     differentiated = jax.value_and_grad(lambda *trees: loss(*trees, None), argnums=(0, 1), has_aux=True)
-    (value, given), (gradients, cotangents) = differentiated(params, dry.probes())
+    (value, given), (gradients, sent) = differentiated(params, zeros)
     own: dict[str, Named] = {}
     for name, gradient in inexact_leaves(gradients):
-        stages = (parameter_stage(name), *NEAREST[name.split(".")[0]])
-        own.setdefault(next(stage for stage in stages if stage in dry.given), {})[name] = gradient
-    stages = [ObservedStage(name, given[name], cotangents.get(name, {}), own.get(name, {})) for name in dry.given]
-    return value, stages
-
-
-def parameter_stage(name: str) -> str:
-    """The stage that uses a parameter, by the parameter's path, as decoder.trunk_0.kernel."""
-    part, *inner = name.split(".")
-    if part != "encoder":
-        return {"reader": "vertex features", "decoder": "raw heads", "driver": "posed Gaussians"}[part]
-    if inner[0] == "transformer":
-        return {"input_norm": "input norm", "norm": "final norm"}.get(inner[1], inner[1].replace("_", " "))
-    return {"tokenizer": "tokens", "class_token": "tokens", "upsampler": "maps"}.get(inner[0], "encoding")
+        users = [stage for stage in given if name.startswith(f"{stage}.")] or ["driver"]
+        own.setdefault(max(users, key=len), {})[name] = gradient
+    report = lambda name, values: StageReport(name, values, *sent.get(name, ({}, {})), own.get(name, {}))
+    return value, [report(name, given[name]) for name in (*dry.given, "loss")]  # a transformation sorts what it returns
 
 
 def diagnose_step(
@@ -107,7 +297,7 @@ def diagnose_step(
 
     It works subject by subject: each has its own batch statistics, even where a microbatch would share them.
     """
-    config = config.at(int(state.step))
+    config, step = config.at(int(state.step)), int(state.step)
     parts = {
         "parameters": state.params,
         "batch statistics": state.batch_stats,
@@ -115,23 +305,17 @@ def diagnose_step(
         "averaged parameters": state.ema_params,
         "loss networks": networks,
     }
-    stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
+    stored = [stored_report(name, tree) for name, tree in parts.items() if jax.tree.leaves(tree)]
     keys = subject_keys(seed_numbers(config.seed), state.step, len(batch.inputs.betas))
     found = []
     for subject, key in enumerate(bar(keys, desc="diagnose", unit="subject", shown=watched())):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
         loss, stages = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
-        diagnosis = Diagnosis(
-            step=int(state.step),
-            subject=subject,
-            loss=float(loss),
-            skip_norm=config.optimizer.skip_norm,
-            stored=(*stored, StageReport("batch", leaves(example))),
-            stages=tuple(StageReport(x.name, *map(leaves, (x.values, x.cotangents, x.gradients))) for x in stages),
-        )
-        if diagnosis.fault is not None:
-            return diagnosis
-        found.append(diagnosis)
+        given = (*stored, stored_report("batch", example))
+        limit, reports = config.optimizer.skip_norm, tuple(map(numbers, stages))
+        found.append(Diagnosis(step, subject, float(loss), limit, given, reports))
+        if found[-1].fault is not None:
+            return found[-1]
     return max(found, key=lambda diagnosis: diagnosis.gradient_norm)
 
 

@@ -107,7 +107,7 @@ class Watch:
 
     def __init__(self, log: RunLog, state: TrainState):
         self._log, self._pending = log, None
-        self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
+        self._counts = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
         self._in_a_row = self._without_gradient = 0
 
     def __call__(self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list) -> None:
@@ -121,31 +121,26 @@ class Watch:
         """Read the metrics of the pending step, and report it if it failed."""
         if self._pending is None:
             return
-        done, metrics, bad_samples = self._pending
-        self._pending = None
+        (done, metrics, bad_samples), self._pending = self._pending, None
         numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        skipped, nonfinite = int(numbers["skipped"]), int(numbers["nonfinite"])
-        was_skipped, was_nonfinite = skipped > self._skipped, nonfinite > self._nonfinite
-        self._skipped, self._nonfinite = skipped, nonfinite
-        self._in_a_row = self._in_a_row + 1 if was_skipped else 0
+        counts = int(numbers["skipped"]), int(numbers["nonfinite"])
+        skipped, replaced = (now > before for now, before in zip(counts, self._counts, strict=True))
+        self._counts = counts
+        self._in_a_row = self._in_a_row + 1 if skipped else 0
         self._without_gradient = self._without_gradient + 1 if numbers["grad_norm"] == 0 else 0
         if self._without_gradient == MANY_SKIPPED:
             advice = "no loss depends on a parameter any more; a learning rate that is too high does that"
             self._log.event(done, "stuck", f"{MANY_SKIPPED} steps in a row had a gradient of 0: {advice}")
-        if not (was_skipped or was_nonfinite):
-            return
-        text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
-        samples = bad_samples()
-        details = numbers | ({"samples": samples} if samples else {})
-        text = "; ".join([text, *samples])
-        if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **details)
-        else:
-            self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **details
-            )
-        if samples and jax.process_index():  # whose log is not written
-            logger.warning("step %d: %s", done, text)
+        if skipped or replaced:
+            samples = bad_samples()
+            text = "; ".join([f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}", *samples])
+            event = "skipped" if skipped else "nonfinite"
+            what = f"skipped ({text}), {counts[0]} so far"
+            if not skipped:
+                what = f"gradient entries that were not finite were replaced ({text})"
+            self._log.event(done, event, what, **numbers, **({"samples": samples} if samples else {}))
+            if samples and jax.process_index():  # whose log is not written
+                logger.warning("step %d: %s", done, text)
         if self._in_a_row == MANY_SKIPPED:
             advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
             self._log.event(done, "stuck", advice)

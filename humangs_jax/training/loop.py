@@ -27,7 +27,7 @@ from humangs_jax.data.loading import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png
-from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
 from humangs_jax.training.checkpoint import Checkpoints, save_config
@@ -36,7 +36,7 @@ from humangs_jax.training.log import RunLog, Watch
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, seed_numbers, train_step
+from humangs_jax.training.step import seed_numbers, train_step, update
 from humangs_jax.training.validation import sheet, validate, validation_examples
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,6 @@ SHOWN = 4
 """Validation subjects on the sheet."""
 DROPPED = {
     "dropped_tokens": "patches without room, mean: model.runtime.token_capacity is too small for these photos",
-    "dropped_reads": "vertices without room, mean: model.runtime.vertex_capacity is too small for these photos",
     "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
 }
 """What the numbers of a validation say that should be 0."""
@@ -178,9 +177,8 @@ def _rehearse(make_source, config, step, state, body, networks, mesh):
     """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle of it."""
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
     part = config.at(step)
-    jitted_train_step().eval_shape(
-        state, batch, body, networks, seed_numbers(part.seed), config=compiled_for(part), mesh=mesh
-    )
+    one = functools.partial(update, config=compiled_for(part), mesh=mesh)
+    jax.eval_shape(one, state, batch, body, networks, seed_numbers(part.seed))
 
 
 def _report(log, out, done, numbers, image):

@@ -1,14 +1,24 @@
-"""All that a run carries from step to step. Random numbers are not in it: they follow from the seed and the step."""
+"""All that a run carries from step to step, and the optimizer whose state is part of it.
+
+Random numbers are not in it: they follow from the seed and the step. The optimizer as published: AdamW, warm-up and cosine,
+clipped gradients, and a guard against bad steps. A gradient is made finite entry by entry first (NaN becomes 0, infinities
++-1e-6). A step whose gradient norm exceeds `skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor
+moments nor the schedule, and is counted, and so is every step that had anything to make finite.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
-from humangs_jax.core.array_types import Array, Int, PyTree
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
-from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.optimizer import make_optimizer
+from humangs_jax.training.config import OptimizerConfig, TrainConfig
+
+INFINITY_STAND_IN = 1e-6
 
 
 @pytree_dataclass
@@ -46,3 +56,75 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
         opt_state=make_optimizer(config.optimizer, config.steps).init(params),
         ema_params=None if config.ema_decay is None else jax.tree.map(jnp.copy, params),
     )
+
+
+class GuardState(NamedTuple):
+    """skipped: steps skipped so far. nonfinite: steps so far whose loss or gradient was not finite, skipped or not.
+
+    norm: gradient norm of the last step, made finite, before clipping. inner: what is guarded.
+    """
+
+    skipped: Int[Array, ""]
+    nonfinite: Int[Array, ""]
+    norm: Float[Array, ""]
+    inner: PyTree
+
+
+def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
+    """Step number -> learning rate of a run of `steps` steps."""
+    warmup = min(config.warmup_steps, steps)
+    return optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(steps, warmup + 1))
+
+
+def decayed(params: PyTree) -> PyTree:
+    """True for the parameters that weight decay acts on."""
+    return jax.tree.map(lambda x: x.ndim >= 2, params)
+
+
+def finite_gradients(gradients: PyTree) -> PyTree:
+    """NaN entries become 0 and infinite ones +-1e-6."""
+    stand_in = INFINITY_STAND_IN
+    return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
+
+
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether every entry of every leaf is finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
+
+
+def gradient_norm(gradients: PyTree) -> Scalar:
+    """Euclidean norm over all entries of all leaves."""
+    return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
+
+
+def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.GradientTransformationExtraArgs:
+    """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not finite.
+
+    The loss is the extra argument `value` of `update`.
+    """
+
+    def init(params):
+        # two arrays: a state that is donated may not hold one buffer twice
+        counts = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+        return GuardState(*counts, jnp.zeros(()), inner.init(params))
+
+    def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
+        finite = jnp.isfinite(value) & all_finite(gradients)
+        gradients = finite_gradients(gradients)
+        norm = gradient_norm(gradients)
+        good = jnp.isfinite(value) & (norm <= skip_norm)
+        updates, advanced = inner.update(gradients, state.inner, params)
+        keep = lambda new, old: jnp.where(good, new, old)
+        updates = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), updates)
+        advanced = jax.tree.map(keep, advanced, state.inner)
+        return updates, GuardState(state.skipped + ~good, state.nonfinite + ~finite, norm, advanced)
+
+    # optax types the constructor's second argument as that of its base class, which knows no extra arguments
+    return optax.GradientTransformationExtraArgs(init, update)  # ty: ignore[invalid-argument-type]
+
+
+def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformationExtraArgs:
+    """The optimizer of a run of `steps` steps; its state is a `GuardState`."""
+    named = getattr(optax, config.name)
+    inner = named(learning_rate(config, steps), *config.betas, weight_decay=config.weight_decay, mask=decayed)
+    return guard(optax.chain(optax.clip_by_global_norm(config.clip_norm), inner), config.skip_norm)

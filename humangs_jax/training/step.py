@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -13,34 +13,25 @@ from jax.sharding import Mesh, PartitionSpec
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
 from humangs_jax.core.compiling import compiler_options
-from humangs_jax.core.pytree import replace
+from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.losses import squared_error, surface_distance, tightness, translucency
+from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
+from humangs_jax.losses.losses import loss_terms
 from humangs_jax.losses.metrics import psnr
-from humangs_jax.losses.perceptual import lpips, perceptual_loss
-from humangs_jax.losses.ssim import multiscale_structural_dissimilarity
-from humangs_jax.network.parts import HumanGSOutputs
-from humangs_jax.network.stages import StageCaller, call, inexact_leaves
+from humangs_jax.network.parts import stage
 from humangs_jax.training import sharding
 from humangs_jax.training.augmentation import augment
-from humangs_jax.training.config import LossConfig, TrainConfig, compiled_for
-from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example
-from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
-from humangs_jax.training.state import TrainState
+from humangs_jax.training.config import TrainConfig, compiled_for
+from humangs_jax.training.forward import draw_targets, reconstruct_example
+from humangs_jax.training.state import GuardState, TrainState, learning_rate, make_optimizer
 
 SUBJECTS = "subjects"
 """Name of the vmap axis over the subjects that a device works on at once, along which batch statistics are shared."""
-COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
+COUNTS = ("dropped_tokens", "overflow")
 """Metrics that are sums over a batch; all others are means."""
-ALWAYS = ("squared", "structural", "silhouette", "tightness")
-"""Terms that are computed, for the log, whatever their weight."""
-OF_COLORS = ("squared", "structural", "absolute", "perceptual", "lpips")
-"""Terms that compare colors: those of a network that draws pixels. For it the others do not exist, whatever their weight."""
 AUGMENTED = 1
 """Makes the key of a subject's augmentation from that of its backgrounds."""
-NO_NETWORKS = LossNetworks()
 
 Metrics = dict[str, Shaped[Array, ""]]
 Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
@@ -58,69 +49,6 @@ def change_background(targets: SubjectViews, backgrounds: Float[Array, "v 3"]) -
     """The target photos, which are on white, as they would look on other colors."""
     uncovered = 1 - targets.masks[..., None]
     return targets.images + uncovered * (backgrounds[:, None, None, :] - 1)
-
-
-def loss_terms(
-    drawn: DrawnTargets,
-    outputs: HumanGSOutputs,
-    images: Float[Array, "v h w 3"],
-    targets: SubjectViews,
-    config: LossConfig,
-    networks: LossNetworks = NO_NETWORKS,
-    stage: StageCaller = call,
-) -> Metrics:
-    """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
-
-    Raises: ValueError if a term has a weight but what it needs is missing.
-    """
-    dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
-    masks = targets.masks
-    terms: dict[str, Callable[..., Array]] = {
-        "squared": lambda t: squared_error(t["rgb"], images),
-        "structural": lambda t: jax.vmap(dissimilarity)(t["rgb"], images),
-        "silhouette": lambda t: squared_error(t["alpha"], masks),
-        "tightness": lambda t: jnp.zeros(()) if t["tight_offsets"] is None else tightness(t["tight_offsets"]),
-        "absolute": lambda t: jnp.abs(t["rgb"] - images),
-        "boundary": lambda t: jnp.abs(t["alpha"] - masks),
-        "opaque": lambda t: translucency(t["opacities"]),
-        "distortion": lambda t: t["spread"],
-        "shells": lambda t: _required(t["shell_spread"], "shells", "shell of the reader"),
-        "depth": lambda t: surface_distance(
-            t["depth"], t["alpha"], _required(targets.depths, "depth", "depth of the targets"), masks
-        ),
-        "perceptual": lambda t: _each(
-            functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19")), t["rgb"], images
-        ),
-        "lpips": lambda t: _each(
-            functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS")), t["rgb"], images
-        ),
-    }
-    rendering = drawn.rendering
-    learned = {
-        "rgb": rendering.rgb,
-        "alpha": rendering.alpha,
-        "depth": rendering.depth,
-        "spread": drawn.spread,
-        "opacities": outputs.gaussians.opacities if drawn.opacities is None else drawn.opacities,
-        "tight_offsets": outputs.tight_offsets if drawn.tight_offsets is None else drawn.tight_offsets,
-        "shell_spread": outputs.shell_spread,
-    }
-    used = [name for name in terms if name in ALWAYS or getattr(config, name)]
-    if outputs.is_empty:
-        used = [name for name in used if name in OF_COLORS]
-    mean = lambda term: lambda seen: jnp.mean(term(seen))
-    return {name: stage(f"loss: {name}", mean(terms[name]), learned) for name in used}
-
-
-def _required(needed, name, title):
-    if needed is None:
-        raise ValueError(f"loss.{name} is not 0, but there is no {title}")
-    return needed
-
-
-def _each(compare, predicted, targets):
-    """One view after the other: the features of all at once would be the largest arrays of a step."""
-    return jax.lax.map(jax.checkpoint(lambda pair: compare(*pair)), (predicted, targets))
 
 
 @functools.cache
@@ -144,30 +72,27 @@ def subject_loss(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
     axis_name: str | tuple[str, ...] | None = None,
-    stage: StageCaller = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
-    """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
+    """Loss of one subject, with the updated batch statistics and metrics."""
     if config.augmentation.share:
         example = augment(jax.random.fold_in(key, AUGMENTED), example, body, config.augmentation)
-    variables = {"params": params, "batch_stats": batch_stats}
-    outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name, stage)
-    targets = example.targets
-    colored = 0.0 if config.model.architecture.draws_pixels else config.loss.random_background
+    variables, targets = {"params": params, "batch_stats": batch_stats}, example.targets
+    outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name)
+    driver = config.model.architecture.driver
+    colored = config.loss.random_background if driver is None or driver.has_alpha else 0.0
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
-    drawn = draw_targets(outputs, body, example.inputs, targets, backgrounds, config, stage, variables)
-    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
-    total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
-    loss = stage("loss", total, terms)
+    drawn = draw_targets(variables, outputs, body, example.inputs, targets, backgrounds, config)
+    compare = lambda drawn: loss_terms(drawn, images, targets.masks, targets.depths, config.loss, networks)
+    terms = stage("loss", compare, drawn, apart=True)
     metrics = {
         **terms,
         "psnr": jnp.mean(jax.vmap(psnr)(drawn.rendering.rgb, images)),
         "dropped_tokens": outputs.dropped_tokens,
-        "dropped_reads": outputs.dropped_reads,
         "overflow": jnp.sum(drawn.rendering.overflow),
     }
-    return loss, (batch_stats, metrics)
+    return sum(getattr(config.loss, name) * term for name, term in terms.items()), (batch_stats, metrics)
 
 
 def local_gradients(
@@ -258,37 +183,39 @@ def train_step(
     networks: LossNetworks = NO_NETWORKS,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped and
-    nonfinite (steps so far), dropped_tokens, dropped_reads and overflow (what did not fit its buffers in this step).
-
-    Arguments: state is given away (donated). batch: an `Example` with a leading axis of subjects. body: decimated
-    already. config: static, of one stage. networks: of the losses that need them. mesh: static; where there is one, state,
-    batch, body and networks lie on it, see `sharding`.
-    Raises: ValueError for parameters of fewer than 32 bits.
-    """
-    seed = seed_numbers(config.seed)
-    return jitted_train_step()(state, batch, body, networks, seed, config=compiled_for(config), mesh=mesh)
+    """`update`, compiled; the state is given away (donated)."""
+    return compiled_update()(state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh)
 
 
 @functools.cache
-def jitted_train_step() -> Any:
-    """The jitted function behind `train_step`, called as f(state, batch, body, networks, seed, config=, mesh=).
+def compiled_update() -> Callable[..., tuple[TrainState, Metrics]]:
+    """`update` for the default backend; a step of all runs that differ in host settings alone is one program."""
+    static, options = ("config", "mesh"), compiler_options()
+    return jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
 
-    seed: `seed_numbers`; without it that of the configuration is a constant of the program.
+
+def update(
+    state: TrainState,
+    batch: Example,
+    body: BodyModel,
+    networks: LossNetworks,
+    seed: Shaped[Array, " n"] | Shaped[np.ndarray, " n"],
+    config: TrainConfig,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, Metrics]:
+    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped and
+    nonfinite (steps so far), dropped_tokens and overflow (what did not fit its buffers in this step).
+
+    Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already. networks: of the losses that need
+    them. seed: `seed_numbers`. config: static, of one stage. mesh: static; where there is one, state, batch, body and networks
+    lie on it, see `sharding`. Raises: ValueError for parameters of fewer than 32 bits.
     """
-    return jax.jit(
-        _train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=compiler_options()
-    )
-
-
-def _train_step(state, batch, body, networks, seed=None, *, config, mesh):
     for name, leaf in inexact_leaves(state.params):
         if jnp.finfo(leaf.dtype).bits < 32:
             raise ValueError(
                 f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates would be rounded away; to "
                 'compute in bfloat16, keep the parameters and set model.runtime.dtype to "bfloat16"'
             )
-    seed = seed_numbers(config.seed) if seed is None else seed
     keys = subject_keys(seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh
@@ -297,10 +224,8 @@ def _train_step(state, batch, body, networks, seed=None, *, config, mesh):
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params, value=loss)
     opt_state = cast(GuardState, opt_state)
     good = opt_state.skipped == state.opt_state.skipped
-    params = optax.apply_updates(state.params, updates)
-    ema_params = state.ema_params
-    if ema_params is not None:
-        assert config.ema_decay is not None  # or there would be no average
+    params, ema_params = optax.apply_updates(state.params, updates), state.ema_params
+    if ema_params is not None and config.ema_decay is not None:
         # the average starts short, so that it forgets the initial parameters
         decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
         ema_params = optax.incremental_update(params, ema_params, 1 - decay)

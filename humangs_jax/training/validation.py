@@ -14,7 +14,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loading import Example, ViewSampling
-from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.losses.ssim import similarity_map
@@ -23,8 +23,7 @@ from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import predict
 from humangs_jax.training.sources import MakeSource
 
-NO_NETWORKS = LossNetworks()
-METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "dropped_reads", "overflow")
+METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "overflow")
 
 
 def validation_examples(make_source: MakeSource, config: TrainConfig, count: int) -> list[Example]:
@@ -55,17 +54,16 @@ def evaluate(
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
-    shown = jnp.clip(drawn.rgb, 0, 1)
+    shown = jnp.clip(drawn.rendering.rgb, 0, 1)
     metrics = {
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
         "psnr_fg": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
         "semi_transparent": jnp.full((), jnp.nan)
-        if outputs.is_empty
-        else jnp.mean(jax.vmap(semi_transparent)(drawn.alpha, masks)),
+        if drawn.opacities is None
+        else jnp.mean(jax.vmap(semi_transparent)(drawn.rendering.alpha, masks)),
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
-        "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
-        "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),
+        "overflow": jnp.sum(drawn.rendering.overflow).astype(shown.dtype),
     }
     if networks.lpips is not None:
         compare = functools.partial(lpips, networks.lpips)

@@ -23,13 +23,14 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.losses.loss_networks import NO_NETWORKS
+from humangs_jax.losses.losses import loss_terms
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, white_backgrounds
-from humangs_jax.training.step import loss_terms
 
 VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 200, 55, 2, 2, 32, 24
 CHANGES = (1e-8, 1e-9, 1e-10, 5e-11)
@@ -241,8 +242,9 @@ def compiled(case, dtype):
         targets = replace(targets, cameras=point["target_cameras"], **point["target_pose"])
         variables = {"params": point["params"], "batch_stats": batch_stats}
         outputs, _ = apply_humangs(variables, inputs, config.model, case.train)
-        drawn = draw_targets(outputs, as_jax(own_body), targets, targets, white_backgrounds(targets), config)
-        terms = loss_terms(drawn, outputs, targets.images, targets, config.loss)
+        given = as_jax(own_body), targets, targets, white_backgrounds(targets), config
+        drawn = draw_targets(variables, outputs, *given)
+        terms = loss_terms(drawn, targets.images, targets.masks, targets.depths, config.loss, NO_NETWORKS)
         total = sum(getattr(config.loss, name) * term for name, term in terms.items())
         return total, {
             "overflow": jnp.sum(drawn.rendering.overflow),

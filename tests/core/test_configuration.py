@@ -92,13 +92,13 @@ def test_a_file_names_the_path_of_the_field():
             config_from_json(Fit, text)
         assert str(caught.value).startswith(said)
     nested = json.loads(config_to_json(settings.PRESETS["best"]))
-    nested["runtime"]["attention_chunk"] = 0
-    with pytest.raises(ValueError, match=r"config\.runtime\.attention_chunk 0: expected 1 to 65,536"):
+    nested["runtime"]["body_vertices"] = 0
+    with pytest.raises(ValueError, match=r"config\.runtime\.body_vertices 0: expected 1 to 10,000,000"):
         config_from_json(settings.Settings, json.dumps(nested))
 
 
 def test_an_execution_is_checked_however_it_is_made():
-    for changes in ({"image_size": 10**6}, {"image_size": 0}, {"attention_chunk": 0}, {"token_capacity": -5}):
+    for changes in ({"image_size": 10**6}, {"image_size": 0}, {"body_vertices": 0}, {"token_capacity": -5}):
         with pytest.raises(ValueError, match="Runtime"):
             Runtime(**changes)
 

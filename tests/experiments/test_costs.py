@@ -8,7 +8,7 @@ import pytest
 from jax.sharding import AxisType, PartitionSpec
 
 from experiments.costs import costs_of, temporary_mb
-from humangs_jax.network.convolution import convolve
+from humangs_jax.network.maps import convolve
 
 N = 8
 A = jnp.zeros((N, N))

@@ -16,10 +16,10 @@ from experiments.systems.two_stream import TwoStreamReader
 from experiments.systems.unet import UNet
 from humangs_jax.body.model import Texels
 from humangs_jax.core.pytree import replace
-from humangs_jax.network.bilinear import sample_bilinear
 from humangs_jax.network.humangs import apply_humangs, decode, encode, read
-from humangs_jax.network.inputs import subject_unit
-from humangs_jax.network.pixel_aligned import project_vertices
+from humangs_jax.network.maps import sample_bilinear
+from humangs_jax.network.parts import subject_unit
+from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.upsampler import UpsamplerConfig
 
 ATTENDING = ("cross_attention", "lhm_views", "lhm_plus")
@@ -65,7 +65,7 @@ def test_each_makes_gaussians_that_can_be_posed(name):
         count = VERTICES * getattr(config.architecture.decoder, "gaussians_per_vertex", 1)
         assert shapes.skinning_weights is None and shapes.tight_offsets.shape[0] == VERTICES
     assert shapes.gaussians.means.shape == (count, 3)
-    assert not config.architecture.runs_per_target  # re-posing runs no network
+    assert config.architecture.driver is None  # re-posing runs no network
 
 
 @pytest.mark.slow

@@ -12,23 +12,26 @@ from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small
 from training_cases import tube
 
 from experiments.systems.correction import CorrectionMLP, apply_corrections
-from experiments.systems.surface_gaussians import PoseMapDriver, TextureDriver
+from experiments.systems.pixel_queries import QueryDriver
+from experiments.systems.surface_gaussians import PoseAttention, PoseMapDriver, TextureDriver
+from experiments.systems.surface_map import SurfaceMap
+from experiments.systems.targets import PixelDriver, target_queries
 from humangs_jax.avatar.reconstruct import make_avatar
-from humangs_jax.avatar.targets import frame_outputs, target_pixels, target_queries
-from humangs_jax.body.model import BodyPose
+from humangs_jax.body.model import BodyPose, person_vertices
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.core.pytree import replace
+from humangs_jax.geometry import quaternion
 from humangs_jax.network.config import Architecture
-from humangs_jax.network.humangs import apply_humangs, draw_pixels
-from humangs_jax.network.parts import Driver, PixelDecoder
-from humangs_jax.network.surface_map import SurfaceMap, surface_texels
+from humangs_jax.network.humangs import apply_humangs, part_variables
+from humangs_jax.network.parts import Driver, Encoding, Target
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
+from humangs_jax.rendering.gaussians import Gaussians
 
 TARGETS = views(seed=1, count=3)
 BETAS = jnp.zeros(1)
 QUERIES = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (3, SIZE, SIZE, 9)), jnp.float32)
 OTHER_POSE = QUERIES.at[..., 6:].set(-QUERIES[..., 6:])
-ask = jax.jit(target_queries, static_argnames="config")
+ask = jax.jit(lambda body, targets, config: target_queries(body, targets, config)[1], static_argnums=2)
 
 
 @functools.cache
@@ -42,8 +45,21 @@ def inputs_of(name):
 @functools.cache
 def drawing(name):
     """(variables, inputs, queries) -> images."""
-    config = small(name)
-    return jax.jit(lambda v, x, q: draw_pixels(v, apply_humangs(v, x, config)[0], q, config))
+    return jax.jit(functools.partial(draw, small(name)))
+
+
+def draw(config, variables, inputs, queries):
+    outputs, _ = apply_humangs(variables, inputs, config)
+    own, nobody = part_variables(variables, "driver"), BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
+    one = lambda query: config.architecture.driver.apply(
+        own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.run()
+    )
+    return jnp.stack([one(query) for query in queries])
+
+
+def frame_outputs(variables, outputs, body, at, config):
+    target = Target(at, person_vertices(body, BETAS, at))
+    return config.architecture.driver.apply(part_variables(variables, "driver"), outputs, target, config.run())
 
 
 @functools.cache
@@ -53,7 +69,7 @@ def driving(name):
 
     def run(variables, inputs, pose):
         outputs, _ = apply_humangs(variables, inputs, config)
-        return frame_outputs(variables, outputs, body, BETAS, pose, config), outputs
+        return frame_outputs(variables, outputs, body, pose, config), outputs
 
     return jax.jit(run)
 
@@ -138,18 +154,17 @@ def test_targets_ask_by_rays_and_their_pose_and_their_photos_are_not_read():
 
 def test_humanram_without_its_texture_and_convolutions_is_lvsm():
     config = small("humanram")
-    config = config.with_parts(decoder=dataclasses.replace(config.architecture.decoder, fusion=None))
+    config = config.with_parts(driver=dataclasses.replace(config.architecture.driver, fusion=None))
     variables = random_variables(config)
-    params = dict(variables["params"]["decoder"])
+    params = dict(variables["params"]["driver"])
     assert params["texture"].shape == (3, 8, 8, 2)
     untextured = {**params, "texture": jnp.zeros((3, 8, 8, 2))}
     lvsm = {name: value for name, value in params.items() if name != "texture"}
     for name, channels in (("photo_tokens", 9), ("target_tokens", 6)):
         kernel = params[name]["kernel"].reshape(PATCH**2, channels + 6, -1)
         lvsm[name] = {"kernel": kernel[:, :channels].reshape(PATCH**2 * channels, -1)}
-    in_place = lambda params: {"params": {"decoder": params}, "batch_stats": {}}
-    draw = jax.jit(lambda v: draw_pixels(v, apply_humangs(v, inputs_of("lvsm"), config)[0], QUERIES, config))
-    theirs = draw(in_place(untextured))
+    in_place = lambda params: {"params": {"driver": params}, "batch_stats": {}}
+    theirs = jax.jit(functools.partial(draw, config))(in_place(untextured), inputs_of("lvsm"), QUERIES)
     close(theirs, drawing("lvsm")(in_place(lvsm), inputs_of("lvsm"), QUERIES))
 
 
@@ -158,20 +173,18 @@ def test_a_target_of_any_size_is_drawn():
     config, variables, inputs = small("humanram"), random_variables(small("humanram")), inputs_of("humanram")
     cameras = replace(TARGETS.cameras, width=SIZE - 3, height=SIZE - 9)
     cut = replace(TARGETS, cameras=cameras, images=TARGETS.images[:, : SIZE - 9, : SIZE - 3])
-    draw = lambda v: target_pixels(v, apply_humangs(v, inputs, config)[0], tube(), cut, config)
-    images = jax.jit(draw)(variables)
+    driver, own = config.architecture.driver, part_variables(variables, "driver")
+    images = jax.jit(lambda v: driver.images(own, apply_humangs(v, inputs, config)[0], tube(), cut, config))(variables)
     assert images.shape == (3, SIZE - 9, SIZE - 3, 3)
     whole = drawing("humanram")(variables, inputs, ask(tube(), TARGETS, config)[:, : SIZE - 8])
     close(images, whole[:, : SIZE - 9, : SIZE - 3])
 
 
-def test_a_network_that_draws_pixels_makes_no_avatar_and_others_draw_none():
+def test_a_network_that_draws_pixels_makes_no_avatar():
     config = small("lvsm")
     outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lvsm"), config)[0], random_variables(config))
-    with pytest.raises(ValueError, match="QueryDecoder draws images without Gaussians"):
+    with pytest.raises(ValueError, match="PhotoDecoder draws images without Gaussians"):
         make_avatar(outputs, tube(), BETAS, config)
-    with pytest.raises(ValueError, match="VertexDecoder makes Gaussians"):
-        draw_pixels({}, outputs, QUERIES, small("lca"))
 
 
 # Drivers -------------------------------------------------------------------------------------------------------------
@@ -249,6 +262,54 @@ def test_corrections_are_bounded_and_zeros_are_none():
     np.testing.assert_allclose(jnp.linalg.norm(offsets, axis=1), 0.1 * 3**0.5, rtol=1e-5)
 
 
+def test_corrections_turn_gaussians_about_the_axes_of_the_body():
+    """A quarter turn about z takes a Gaussian that is long along y to one that is long along x, however it was written."""
+    half = 0.5**0.5
+    gaussians = Gaussians(
+        means=jnp.zeros((1, 3)),
+        quats=jnp.asarray([[half, half, 0.0, 0.0]]),  # a quarter turn about x: the long z axis points to -y
+        scales=jnp.asarray([[0.01, 0.01, 0.1]]),
+        opacities=jnp.asarray([0.5]),
+        colors=jnp.full((1, 3), 0.5),
+    )
+    raw = jnp.zeros((1, 14)).at[0, 3:7].set(jnp.asarray([half - 1, 0, 0, half]))  # added to the identity
+    turned = apply_corrections(gaussians, raw, 0.1).gaussians
+    long = quaternion.to_matrix(turned.quats)[0, :, 2]
+    np.testing.assert_allclose(jnp.abs(long), [1, 0, 0], atol=1e-6)
+
+
+def test_texels_attend_by_scaled_products():
+    """Products grow with the width; their softmax must not: of random features it stays far from one token."""
+    module, width = PoseAttention(width=4, tokens=2), 4
+    x, pose_vector = jnp.asarray([[[[1.0, 2, 3, 4]]]]), jnp.ones(3)
+    params = jax.tree.map(jnp.zeros_like, module.init(jax.random.key(0), x, pose_vector)["params"])
+    eye = {"kernel": jnp.eye(width)}
+    context = jnp.asarray([[1.0, 0, 0, 0], [0, 0, 1.0, 0]])  # products with x: 1 and 3
+    params |= {"query": eye, "key": eye, "value": eye, "out": eye}
+    params["pose_1"] = params["pose_1"] | {"bias": context.reshape(-1)}
+    seen = module.apply({"params": params}, x, pose_vector) - x
+    share = 1 / (1 + np.exp((3 - 1) / width**0.5))
+    np.testing.assert_allclose(seen[0, 0, 0], [share, 0, 1 - share, 0], rtol=1e-5)
+
+
+def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
+    """Texels that two photos see, one red and one green: their weights are exp(sharpness * cosine)."""
+    inputs = inputs_of("giga")
+    images = jnp.stack([jnp.full_like(inputs.images[0], 0).at[..., i].set(1.0) for i in range(2)])
+    inputs = replace(inputs, images=images, depth_maps=0 * inputs.depth_maps + 100.0)
+    config = small("giga")
+    colors = {}
+    for sharpness in (0.0, 2.0, 4.0):
+        reader = dataclasses.replace(config.architecture.reader, sharpness=sharpness)
+        colors[sharpness] = reader.apply({}, Encoding(images, None, jnp.int32(0)), inputs, config.run()).colors
+    red = lambda sharpness: np.asarray(colors[sharpness][..., 0]).ravel()
+    both = (red(0.0) > 0.49) & (red(0.0) < 0.51) & (np.asarray(colors[0.0][..., 2]).ravel() < 0.1)
+    assert both.sum() > 3  # without sharpness both count the same
+    odds = lambda sharpness: np.log(red(sharpness)[both] / (1 - red(sharpness)[both]))
+    assert np.abs(odds(2.0)).max() > 0.1
+    np.testing.assert_allclose(odds(4.0), 2 * odds(2.0), atol=1e-3)  # log odds grow in proportion
+
+
 # Parts ---------------------------------------------------------------------------------------------------------------
 
 
@@ -256,20 +317,16 @@ def test_corrections_are_bounded_and_zeros_are_none():
 def test_architectures_are_recorded_whole(name):
     architecture = small(name).architecture
     assert config_from_json(Architecture, config_to_json(architecture)) == architecture
-    assert isinstance(architecture.decoder, PixelDecoder) == architecture.draws_pixels == (name in PIXELS)
-    assert isinstance(architecture.driver, Driver) == (name in DRIVEN)
-    assert architecture.runs_per_target
+    assert isinstance(architecture.driver, PixelDriver) == (not architecture.driver.has_alpha) == (name in PIXELS)
+    assert isinstance(architecture.driver, Driver)
 
 
 def test_parts_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="driver: QueryDecoder makes no Gaussians"):
-        small("lvsm").with_parts(driver=CorrectionMLP())
     decoder = dataclasses.replace(small("giga").architecture.decoder, surface_map=SurfaceMap("atlas", 99))
     with pytest.raises(ValueError, match=r"surface_map: expected one for all parts, got .*99"):
         small("giga").with_parts(decoder=decoder)
     with pytest.raises(ValueError, match="class_token: expected false"):
-        decoder = small("lvsm").architecture.decoder
-        dataclasses.replace(decoder, transformer=dataclasses.replace(BLOCKS, class_token=True))
+        QueryDriver(transformer=dataclasses.replace(BLOCKS, class_token=True))
     for wrong in (
         lambda: SurfaceMap(size=10**6),
         lambda: TextureDriver(widths=(8,) * 99),
@@ -282,11 +339,14 @@ def test_parts_that_do_not_fit_are_refused():
         (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),
         (CorrectionMLP(8, 1, joints=2, gaussians_per_vertex=2), r"driver\.gaussians_per_vertex 2: the decoder gives"),
     ):
-        other = small("lca").with_parts(driver=driver)
-        variables, inputs = random_variables(other), inputs_of("lca")
-        outputs = jax.eval_shape(lambda v, x, c: apply_humangs(v, x, c)[0], variables, inputs, other)
+        other, inputs = small("lca").with_parts(driver=driver), inputs_of("lca")
+
+        def frame(other=other, inputs=inputs):
+            variables = random_variables(other)
+            return frame_outputs(variables, apply_humangs(variables, inputs, other)[0], tube(), pose(), other)
+
         with pytest.raises(ValueError, match=said):
-            jax.eval_shape(lambda v, o, c: frame_outputs(v, o, tube(), BETAS, pose(), c), variables, outputs, other)
+            jax.eval_shape(frame)
     with pytest.raises(ValueError, match="works on a map of the surface"):
         mapless = replace(inputs_of("animatable"), texels=None)
         jax.eval_shape(lambda: apply_humangs({}, mapless, small("animatable"))[0])
@@ -295,7 +355,7 @@ def test_parts_that_do_not_fit_are_refused():
 @pytest.mark.slow
 def test_front_and_back_show_both_sides_of_the_body():
     body = tube()
-    texels = surface_texels(body, SurfaceMap("front_back", 16))
+    texels = SurfaceMap("front_back", 16).texels(body)
     assert texels.corners.shape == (16, 32, 3)
     sums = np.asarray(texels.weights.sum(axis=-1))
     covered = np.asarray(texels.covered)
@@ -318,7 +378,7 @@ def test_front_and_back_show_both_sides_of_the_body():
 @pytest.mark.slow
 def test_an_atlas_shows_the_whole_surface_once():
     body = tube()
-    texels = surface_texels(body, SurfaceMap("atlas", 64))
+    texels = SurfaceMap("atlas", 64).texels(body)
     covered = np.asarray(texels.covered)
     shown = np.unique(np.sort(np.asarray(texels.corners)[covered], axis=-1), axis=0)
     assert len(shown) == len(body.faces)

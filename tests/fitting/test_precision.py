@@ -25,7 +25,7 @@ from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry import camera, quaternion, transform
 from humangs_jax.network import vertex_decoder
 from humangs_jax.network.parts import Shells, VertexFeatures
-from humangs_jax.network.pixel_aligned import project_vertices
+from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.vertex_decoder import RawGaussians, VertexDecoder
 from humangs_jax.rendering.gaussians import Gaussians, covariances, skin_gaussians
 from humangs_jax.rendering.projection import project_gaussians

@@ -204,9 +204,7 @@ def chosen(path, value):
 
 OUT_OF_RANGE = {
     "runtime.image_size": (10**6, 0, -8, 1e300),
-    "runtime.attention_chunk": (0, -1, 10**9),
     "runtime.token_capacity": (-5, 10**18),
-    "runtime.vertex_capacity": (0, -1),
     "runtime.body_vertices": (0, -1, 10**12),
     "runtime.longest_edge": (0, -1, 1e-9, 1e300, float("nan")),
     "runtime.raster.rows_per_step": (0, -1, 10**12),

@@ -12,9 +12,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, pack_patches, touched_patches
 from humangs_jax.network.humangs import apply_humangs, encode, needed_tokens, read
-from humangs_jax.network.inputs import subject_unit
-from humangs_jax.network.parts import Encoding
-from humangs_jax.network.reader import needed_reads, project_and_test
+from humangs_jax.network.parts import Encoding, subject_unit
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import Block, TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -261,19 +259,6 @@ def test_subjects_with_different_numbers_of_views_share_a_batch():
     together = jax.jit(jax.vmap(apply))(batch)
     for index, subject in enumerate(subjects):
         assert close(jax.tree.map(lambda x, i=index: x[i], together), jax.jit(apply)(subject), 10 * FLOAT32_TOLERANCE)
-
-
-@pytest.mark.slow
-def test_views_are_read_only_for_the_vertices_they_see():
-    inputs = random_inputs()
-    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))
-    variables, needed = variables_of(TINY), int(needed_reads(inputs, TINY.run()))
-    seen = project_and_test(inputs, TINY.run())[1].sum(axis=1)
-    assert needed == seen.max() and seen.min() < needed
-    of_capacity = lambda n: TINY.with_runtime(vertex_capacity=n)
-    reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))
-    assert close(exact, reference) and exact.dropped_reads == 0
-    assert tight.dropped_reads == (seen == needed).sum() and not close(tight.gaussians, reference.gaussians)
 
 
 # gradients and batches

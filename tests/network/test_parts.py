@@ -2,39 +2,33 @@
 
 import dataclasses
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from network_cases import TINY, random_inputs
 
-from humangs_jax.core.array_types import Float, Key
-from humangs_jax.core.configuration import Width, config_from_json, config_to_json, part
+from humangs_jax.core.configuration import Width, config_from_json, config_to_json, part, vary
 from humangs_jax.network.config import Architecture, paper_parts
-from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, read
-from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Decoder, Encoder, Encoding, Pass, Reader, Variables, VertexFeatures
-from humangs_jax.network.stages import Recorder
+from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, intermediates, read
+from humangs_jax.network.parts import Decoder, Encoder, Encoding, HumanGSInputs, Pass, Reader, VertexFeatures
 from humangs_jax.network.vertex_decoder import positional_encoding
 from humangs_jax.network.weights import load_weights, save_weights
 
 
 @part
-class LookingReader:
+class LookingReader(Reader):
     """Vertices look at all tokens of all views, by their canonical position."""
 
     width: Width = 8
 
-    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
-        queries, keys = jax.random.split(key)
-        tokens = encoding.maps.shape[-1]
-        draw = lambda key, rows: jax.random.normal(key, (rows, self.width)) * rows**-0.5
-        return {"params": {"query": draw(queries, 39), "key": draw(keys, tokens)}}
-
-    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
-        params, tokens = variables["params"], encoding.maps.reshape(-1, encoding.maps.shape[-1])
-        queries: Float[jax.Array, "n e"] = positional_encoding(inputs.canonical_vertices) @ params["query"]
-        attention = jax.nn.softmax(queries @ (tokens @ params["key"]).T * self.width**-0.5)
+    @nn.compact
+    def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+        tokens = encoding.maps.reshape(-1, encoding.maps.shape[-1])
+        dense = lambda name: nn.Dense(self.width, use_bias=False, name=name)
+        queries = dense("query")(positional_encoding(inputs.canonical_vertices))
+        attention = jax.nn.softmax(queries @ dense("key")(tokens).T * self.width**-0.5)
         return VertexFeatures(attention @ tokens, encoding.global_token, normals=inputs.canonical_normals)
 
 
@@ -78,19 +72,46 @@ def test_a_part_is_named_in_json_and_found_again():
 
 def test_a_part_of_this_name_exists_once_and_only_a_registered_one_is_written():
     with pytest.raises(ValueError, match=r"part LookingReader of elsewhere: .*test_parts has one of this name"):
-        part(type("LookingReader", (), {"__module__": "elsewhere", "__annotations__": {}}))
-    plain = dataclasses.make_dataclass("Plain", [], bases=(LookingReader,), frozen=True)
+        part(type("LookingReader", (Reader,), {"__module__": "elsewhere", "__annotations__": {}}))
+
+    class Plain(LookingReader):
+        pass
+
     with pytest.raises(ValueError, match="Plain is no registered part"):
-        config_to_json(TINY.with_parts(reader=plain()).architecture)
+        config_to_json(TINY.with_parts(reader=Plain()).architecture)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: LookingReader(width=0), r"LookingReader\.width 0: expected 1 to"),
+        (lambda: LookingReader(width="8"), "LookingReader: width: expected int, got '8'"),
+        (lambda: vary(CONFIG, {"architecture.reader.parent": None}), r"no field 'parent'; its fields are \['width'\]"),
+    ],
+)
+def test_fields_of_parts_are_checked(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_parts_are_compared_by_their_configuration():
+    assert LookingReader(width=4) == vary(CONFIG, {"architecture.reader.width": 4}).architecture.reader
+    assert LookingReader(width=4) != LookingReader() and len({LookingReader(), LookingReader(width=8)}) == 1
 
 
 @pytest.mark.slow
-def test_the_pass_is_its_three_parts_and_names_its_stages():
-    variables, inputs, recorder = init_humangs(jax.random.key(0), TINY), random_inputs(), Recorder()
+def test_the_pass_is_its_three_parts_and_can_be_looked_into():
+    variables, inputs = init_humangs(jax.random.key(0), TINY), random_inputs()
     outputs, _ = jax.jit(lambda v: apply_humangs(v, inputs, TINY))(variables)
     encoding = encode(variables, inputs, TINY)
     parts = decode(variables, read(variables, encoding, inputs, TINY), inputs, TINY)
-    jax.eval_shape(lambda v: apply_humangs(v, inputs, TINY, stage=recorder)[0], variables)
-    assert list(recorder.outputs) == ["pixels", "encoding", "vertex features", "raw heads", "canonical Gaussians"]
     for a, b in zip(jax.tree.leaves(outputs.gaussians), jax.tree.leaves(parts.gaussians), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # fused in other ways
+    found = jax.eval_shape(lambda v: intermediates(v, inputs, TINY), variables)
+    assert {"encoder", "encoder.tokenizer", "encoder.transformer.block_3", "reader", "decoder.geometry_out"} <= set(
+        found
+    )
+    assert (
+        found["encoder"].maps.shape == encoding.maps.shape
+        and found[""].gaussians.means.shape == outputs.gaussians.means.shape
+    )

@@ -11,7 +11,6 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.network.parts import Shells, VertexFeatures
 from humangs_jax.network.vertex_decoder import (
     OBLIQUE,
-    DecoderModule,
     RawGaussians,
     VertexDecoder,
     activate,
@@ -101,6 +100,12 @@ def test_gaussians_choose_their_shell_and_its_color():
     assert np.all(np.abs(slope(jnp.zeros_like(logits))[..., (0, 2)]) > 1e-3)
 
 
+def biases_of(decoder, features):
+    """Fresh biases of the last layers: what Gaussians start from, but for tiny weights."""
+    params = decoder.init(jax.random.key(0), features, random_inputs(vertices=2), TINY.run())["params"]
+    return {name: layer["bias"] for name, layer in params.items()}
+
+
 def test_shells_enter_the_decoder_and_start_at_the_surface():
     colors = jnp.full((2, 3, 3), 0.75)
     features = VertexFeatures(
@@ -109,10 +114,8 @@ def test_shells_enter_the_decoder_and_start_at_the_surface():
     entering = decoder_input(features, jnp.zeros((2, 3)))
     assert entering.shape == (2, 1 + 39 + 4 + 3 * 6)
     assert np.allclose(entering[0, -18:], [0.5] * 9 + [1] * 3 + [1, 1, 0] * 2)
-    decoder = DecoderModule(CONFIG, shells=3)
-    raw = decoder.apply(decoder.init(jax.random.key(0), entering), entering)
-    assert raw.shells.shape == (2, CONFIG.gaussians_per_vertex, 3)
-    assert np.all(jax.nn.softmax(raw.shells)[..., 0] > 0.9)
+    first = biases_of(dataclasses.replace(CONFIG, hidden=8), features)["shells_out"].reshape(2, 3)
+    assert np.all(jax.nn.softmax(first)[..., 0] > 0.9)
 
 
 @pytest.mark.slow
@@ -123,8 +126,10 @@ def test_in_the_frame_of_the_normal_gaussians_lie_flat_on_the_surface():
     config = dataclasses.replace(CONFIG, frame="normal")
     entering = decoder_input(VertexFeatures(jnp.zeros((2, 1)), normals=NORMALS), jnp.zeros((2, 3)))
     assert np.array_equal(entering[:, -3:], NORMALS)
-    decoder = DecoderModule(config)
-    raw = decoder.apply(decoder.init(jax.random.key(0), entering), entering)
+    features = VertexFeatures(jnp.zeros((2, 1)), normals=NORMALS)
+    first = biases_of(dataclasses.replace(config, hidden=8), features)
+    geometry = jnp.tile(first["geometry_out"].reshape(1, 2, 10), (2, 1, 1))
+    raw = RawGaussians(geometry, jnp.zeros((2, 2, 4)), None)
     placed = activate(raw, config, VertexFeatures(jnp.zeros((2, 1)), normals=NORMALS))
     thin = placed.scales[..., 2] / placed.scales[..., 0]
     assert np.all((thin > 0.2) & (thin < 0.4))
@@ -156,3 +161,24 @@ def test_scales_follow_the_spacing_of_vertices_and_nothing_else_does():
     finer = decoder.apply(variables, features, replace(inputs, spacing=spacing), run).gaussians
     np.testing.assert_allclose(finer.scales, as_trained.scales * jnp.repeat(spacing, 2)[:, None], rtol=1e-6)
     assert jax.tree.all(jax.tree.map(np.array_equal, replace(finer, scales=0), replace(as_trained, scales=0)))
+
+
+def test_quaternions_are_unit_whatever_the_head_says():
+    raw = random_raw(seed=3)
+    for factor in (1e-3, 1.0, 1e3):
+        quats = activate(dataclasses.replace(raw, geometry=factor * raw.geometry), CONFIG).quats
+        assert np.allclose(np.linalg.norm(quats, axis=-1), 1, atol=1e-6)
+
+
+def test_a_person_twice_as_large_has_gaussians_twice_as_large():
+    """Lengths inside are those of a body of 1.8 m; means, offsets and scales come back to metres."""
+    decoder, features = VertexDecoder(hidden=8, tight=1, free=1), VertexFeatures(jnp.ones((4, 3)), jnp.ones(2))
+    inputs, run = random_inputs(vertices=4), TINY.run()
+    variables = decoder.init(jax.random.key(0), features, inputs, run)
+    larger = replace(inputs, canonical_vertices=2 * inputs.canonical_vertices)
+    one, two = (decoder.apply(variables, features, x, run) for x in (inputs, larger))
+    for name, factor in {"means": 2, "scales": 2, "quats": 1, "opacities": 1, "colors": 1}.items():
+        np.testing.assert_allclose(getattr(two.gaussians, name), factor * getattr(one.gaussians, name), rtol=1e-5)
+    np.testing.assert_allclose(two.tight_offsets, one.tight_offsets, rtol=1e-5)  # in normalised units
+    height = float(jnp.ptp(inputs.canonical_vertices[:, 1]))
+    np.testing.assert_allclose(one.gaussians.scales, jax.nn.softplus(-3.0) * height / 1.8, rtol=0.02)

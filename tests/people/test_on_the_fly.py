@@ -14,7 +14,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import project
-from humangs_jax.network.inputs import subject_unit
+from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.presets import tiny
 from humangs_jax.people import cameras, on_the_fly, rendering, shading
 from humangs_jax.people.bank import build_bank, load_bank, save_bank

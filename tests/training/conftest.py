@@ -10,17 +10,17 @@ from training_cases import tube, write_subject
 
 from humangs_jax.core.compiling import CPU_COMPILER_OPTIONS
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.training import loop, step
+from humangs_jax.training import step
 from humangs_jax.training.config import tiny
 
-make_train_step = step.jitted_train_step.__wrapped__
+make_update = step.compiled_update.__wrapped__
 
 
 @functools.cache
-def quick_train_step():
-    """`jitted_train_step()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny` instead of 74."""
+def quick_update():
+    """`compiled_update()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny` instead of 74."""
     with mock.patch.dict(CPU_COMPILER_OPTIONS, {"xla_backend_optimization_level": 0}):
-        return make_train_step()
+        return make_update()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -29,10 +29,7 @@ def _compiled_quickly(request):
     if getattr(request.module, "OPTIMIZED", False):
         yield
         return
-    with (
-        mock.patch.object(step, "jitted_train_step", quick_train_step),
-        mock.patch.object(loop, "jitted_train_step", quick_train_step),
-    ):
+    with mock.patch.object(step, "compiled_update", quick_update):
         yield
 
 

@@ -90,6 +90,20 @@ def test_cameras_turn_about_the_person(example):
         assert 0.05 < degrees < 12
 
 
+def test_the_person_is_turned_about_wherever_it_stands(example):
+    """The posed pelvis stays where the photo shows it, also 5 m from the world's origin."""
+    pelvis, views = jnp.asarray([0.0, 0.9, 0.1]), example.inputs
+    views = replace(views, translations=views.translations + jnp.asarray([5.0, 0.0, 0.0]))
+    off = augment_views(jax.random.key(5), views, pelvis, dataclasses.replace(NOTHING, camera_degrees=5.0))
+    seen = lambda cameras: jnp.einsum(
+        "vij,vj->vi",
+        cameras.cam_from_world[:, :3],
+        jnp.pad(views.translations + pelvis, ((0, 0), (0, 1)), constant_values=1),
+    )
+    np.testing.assert_allclose(seen(off.cameras), seen(views.cameras), atol=1e-4)
+    assert np.abs(off.cameras.cam_from_world - views.cameras.cam_from_world).max() > 0.01
+
+
 def test_all_photos_of_an_example_have_the_same_wrong_body(example):
     views = example.inputs
     off = augment_views(

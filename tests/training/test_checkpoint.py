@@ -12,8 +12,7 @@ from training_cases import without_upsampler
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.checkpoint import Checkpoints, _checksum, load_config, save_config
 from humangs_jax.training.config import tiny
-from humangs_jax.training.optimizer import OptimizerConfig, make_optimizer
-from humangs_jax.training.state import TrainState
+from humangs_jax.training.state import OptimizerConfig, TrainState, make_optimizer
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 """Orbax leaves callbacks behind when a read fails."""
@@ -129,18 +128,6 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, 
         assert same(again.restore(state_at(0)), state_at(3)), damage
         again.close()
         assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], damage
-
-
-def test_a_checkpoint_that_a_killed_run_was_deleting_goes(tmp_path, same, caplog):
-    first = Checkpoints(tmp_path / "c", keep=3)
-    for step in (1, 2, 3):
-        first.save(state_at(step))
-    first.close()
-    shutil.rmtree(tmp_path / "c" / "1" / "metrics")
-    again = Checkpoints(tmp_path / "c", keep=2)
-    assert same(again.restore(state_at(0)), state_at(3)) and caplog.text == ""
-    again.close()
-    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["2", "3"]
 
 
 def test_no_good_checkpoint_is_one_line_and_changes_nothing(tmp_path):

@@ -13,9 +13,8 @@ from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, Waitin
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.config import tiny
 from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
-from humangs_jax.training.optimizer import GuardState
 from humangs_jax.training.sources import bad_samples
-from humangs_jax.training.state import TrainState
+from humangs_jax.training.state import GuardState, TrainState
 
 
 def read(path):

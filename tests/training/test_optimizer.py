@@ -1,5 +1,8 @@
 """The optimizer's groups, schedule and guard."""
 
+import dataclasses
+import typing
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rounding import bound
 
-from humangs_jax.training.optimizer import (
+from humangs_jax.core.configuration import config_from_json
+from humangs_jax.training.state import (
     INFINITY_STAND_IN,
     OptimizerConfig,
     decayed,
@@ -102,3 +106,17 @@ def test_schedule_warms_up_and_ends_at_zero():
 def test_a_run_shorter_than_its_warm_up_has_a_schedule():
     rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4)
     assert float(rate(4)) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("name", typing.get_args(typing.get_type_hints(OptimizerConfig)["name"]))
+def test_every_optimizer_by_name_goes_downhill_and_keeps_the_guard(name):
+    config = dataclasses.replace(CONFIG, name=name, weight_decay=0.0)
+    params, state = stepped(filled(0.5), config)
+    assert all(np.isfinite(x).all() and (x < 1).all() for x in jax.tree.leaves(params))
+    same, skipped = stepped(filled(1e4), config, state=state)
+    assert int(skipped.skipped) == 1 and jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, PARAMS))
+
+
+def test_another_optimizer_is_refused():
+    with pytest.raises(ValueError, match=r"config\.name: expected .*adamw.*, got 'sgd'"):
+        config_from_json(OptimizerConfig, '{"name": "sgd"}')

@@ -21,8 +21,7 @@ from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.people.writer import Layout, write_person
-from humangs_jax.training.config import LossConfig, TrainConfig
-from humangs_jax.training.optimizer import OptimizerConfig
+from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 from humangs_jax.training.validation import evaluate

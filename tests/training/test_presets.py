@@ -1,6 +1,7 @@
 """Every preset makes a step on all kinds of people that `humangs train` accepts: on disk, in a data set, made on the fly."""
 
 import dataclasses
+import functools
 import logging
 import math
 
@@ -13,12 +14,13 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.views import gaussian_body
+from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.seeds import SPLITS
 from humangs_jax.training.config import PRESETS, fitting_losses
 from humangs_jax.training.sources import captured_people, mixed_people, on_the_fly_people, people_on_disk, stage_loader
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
+from humangs_jax.training.step import seed_numbers, train_step, update
 
 SIZE = 32
 KINDS = ("captures", "data set", "mixture")
@@ -88,7 +90,8 @@ def traced(config, people, body):
     batch = stage_loader(people, config, 0).batch_at(MIXED)
     body = gaussian_body(body, config.model)
     state = jax.eval_shape(lambda: init_state(config))
-    return jitted_train_step().eval_shape(state, batch, body, NO_NETWORKS, config=config, mesh=None), batch
+    step = functools.partial(update, networks=NO_NETWORKS, seed=seed_numbers(config.seed), config=config)
+    return jax.eval_shape(step, state, batch, body), batch
 
 
 @pytest.mark.parametrize("kind", KINDS)

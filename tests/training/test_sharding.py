@@ -1,13 +1,18 @@
 """Divided states: what is gathered is whole, gradients come back as parts of the mean, eight devices agree with one."""
 
+import inspect
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
+from jax.sharding import PartitionSpec
 
-from humangs_jax.training.sharding import SMALLEST_DIVIDED, divided_axis, training_mesh
+from humangs_jax.training.sharding import SMALLEST_DIVIDED, divided_axis, join_processes, mean_parts, training_mesh
 
 EIGHT_DEVICES = Path(__file__).with_name("eight_devices.py")
 
@@ -26,6 +31,28 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
     with pytest.raises(ValueError, match="fsdp 3 does not divide"):
         training_mesh(3, jax.devices()[:1])
     assert dict(training_mesh(devices=jax.devices()[:1]).shape) == {"data": 1, "fsdp": 1}
+
+
+def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
+    """Four devices, two by two, as nested maps with the names of a mesh's axes."""
+    gradients = jnp.asarray(
+        np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
+    )  # data, fsdp, rows, columns
+    mesh = SimpleNamespace(size=4)
+    parts = lambda spec: jax.vmap(
+        jax.vmap(lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"], axis_name="fsdp"),
+        axis_name="data",
+    )(gradients)
+    mean = np.asarray(gradients).mean(axis=(0, 1))
+    np.testing.assert_allclose(parts(PartitionSpec()), np.broadcast_to(mean, (2, 2, 3, 4)), rtol=1e-5)
+    divided = parts(PartitionSpec(None, "fsdp"))
+    for data in range(2):
+        np.testing.assert_allclose(np.concatenate(divided[data], axis=1), mean, rtol=1e-5)
+
+
+def test_half_of_an_address_is_refused(given):
+    with pytest.raises(ValueError, match="give coordinator, number of processes and process index, or none"):
+        join_processes(*given)
 
 
 def on_eight_devices(name):

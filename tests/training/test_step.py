@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import inspect
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,16 +23,20 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.rendering.splatting import render
-from humangs_jax.training.config import tiny
+from humangs_jax.network.parts import Drawn
+from humangs_jax.rendering.splatting import Rendering, render
+from humangs_jax.training import step
+from humangs_jax.training.augmentation import Augmentation
+from humangs_jax.training.config import OptimizerConfig, tiny
 from humangs_jax.training.forward import predict, token_share
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import (
     batch_gradients,
     change_background,
-    jitted_train_step,
     random_backgrounds,
+    seed_numbers,
     train_step,
+    update,
 )
 
 FLOAT64 = 1e-6
@@ -68,7 +74,7 @@ def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
     avatar, _ = compiled(reconstruct_views)(variables, body=body, views=example.inputs, config=model)
     targets = example.targets
     assert jnp.abs(avatar.light.coefficients).max() > 0.01
-    for i, rgb in enumerate(predicted.rgb):
+    for i, rgb in enumerate(predicted.rendering.rgb):
         pose = BodyPose(targets.rotations[i], targets.translations[i])
         expected = render(skin(avatar, pose), targets.cameras[i], CONFIG.splat, jnp.ones(3)).rgb
         np.testing.assert_allclose(rgb, expected, atol=bound(FLOAT32))
@@ -181,11 +187,11 @@ WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss
 @pytest.mark.parametrize(("name", "title"), [("perceptual", "VGG-19"), ("lpips", "LPIPS")])
 def test_a_loss_without_its_network_is_an_error_not_a_number(body, source, variables, name, title):
     loss = dataclasses.replace(CONFIG.loss, **{name: 1.0})
-    step = jitted_train_step()
     with pytest.raises(ValueError, match=f"loss.{name} is not 0, but there is no {title}"):
         config = dataclasses.replace(CONFIG, loss=loss)
         state = init_state(CONFIG, variables)
-        step.eval_shape(state, source.batch_at(0), body, LossNetworks(), config=config, mesh=None)
+        one = functools.partial(update, networks=LossNetworks(), seed=seed_numbers(0), config=config)
+        jax.eval_shape(one, state, source.batch_at(0), body)
 
 
 @pytest.mark.slow
@@ -236,3 +242,86 @@ def test_fewer_photos_have_their_share_of_the_token_capacity(views, capacity):
     config = dataclasses.replace(tiny(), views=ViewSampling(input_counts=(1, 4, 6)))
     config = dataclasses.replace(config, model=config.model.with_runtime(token_capacity=70))
     assert token_share(config, views).runtime.token_capacity == capacity
+
+
+# what a step does with its parts, each of which is exchanged for a plain one; types are not checked there
+
+
+PLAIN = dataclasses.replace(
+    CONFIG, optimizer=OptimizerConfig(learning_rate=1.0, warmup_steps=0, weight_decay=0.0), ema_decay=0.99
+)
+
+
+@pytest.fixture
+def plain_update(monkeypatch):
+    """f(state) -> the state after `update` with a gradient of 1, and the keys that it gave to the subjects of a batch of 2."""
+    keys = []
+
+    def gradients(params, batch_stats, body, batch, subjects, *_):
+        keys.append(jax.random.key_data(subjects))
+        return jnp.zeros(()), jax.tree.map(jnp.ones_like, params), batch_stats, {}
+
+    monkeypatch.setattr(step, "batch_gradients", gradients)
+    batch = SimpleNamespace(inputs=SimpleNamespace(betas=jnp.zeros((2, 1))))
+    return lambda state: (
+        inspect.unwrap(update)(state, batch, None, LossNetworks(), seed_numbers(0), PLAIN)[0],
+        keys[-1],
+    )
+
+
+def test_every_step_and_every_subject_has_random_numbers_of_its_own(plain_update):
+    state = init_state(PLAIN, {"params": {"x": jnp.zeros(3)}, "batch_stats": {}})
+    seen = []
+    for _ in range(3):
+        state, keys = plain_update(state)
+        seen += [tuple(key) for key in np.asarray(keys)]
+    assert len(set(seen)) == 6
+
+
+def test_the_average_forgets_where_it_started(plain_update):
+    """A decay of 0.99 alone would keep 90 % of the start after 10 steps."""
+    far, near = (init_state(PLAIN, {"params": {"x": jnp.full(1, x)}, "batch_stats": {}}) for x in (100.0, 0.0))
+    for _ in range(10):
+        (far, _), (near, _) = plain_update(far), plain_update(near)
+    shift = float(far.params["x"][0] - near.params["x"][0])
+    far = replace(far, ema_params={"x": far.ema_params["x"] - shift})  # both ran alike, from another start
+    np.testing.assert_allclose(far.ema_params["x"], near.ema_params["x"], atol=1e-4)
+    start_only = init_state(PLAIN, {"params": {"x": jnp.full(1, 100.0)}, "batch_stats": {}})
+    moved = replace(start_only, params={"x": jnp.zeros(1)})
+    for _ in range(10):
+        moved, _ = plain_update(moved)
+    assert abs(float(moved.ema_params["x"][0])) < 20  # of the 100 that the average began with
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_a_gradient_is_the_mean_over_subjects_whatever_the_microbatch(monkeypatch, size):
+    def loss(params, batch_stats, body, example, key, config, networks, axis_name):
+        value = params["x"] * example
+        return value, (batch_stats, {"loss": value, "dropped_tokens": example, "overflow": example})
+
+    monkeypatch.setattr(step, "subject_loss", loss)
+    weights, keys = jnp.asarray([1.0, 2.0, 4.0, 9.0]), jax.random.split(jax.random.key(0), 4)
+    config = dataclasses.replace(CONFIG, microbatch_size=size)
+    value, gradients, _, metrics = inspect.unwrap(step.local_gradients)(
+        {"x": jnp.asarray(3.0)}, {}, None, weights, keys, config
+    )
+    assert float(gradients["x"]) == 4.0 and float(value) == float(metrics["loss"]) == 12.0  # means of weights, times 3
+    assert float(metrics["dropped_tokens"]) == float(metrics["overflow"]) == 16.0  # sums
+
+
+def test_augmentation_and_backgrounds_do_not_share_random_numbers(monkeypatch, source, body):
+    """Or the color of the background would tell how the photos were disturbed."""
+    keys = {}
+    take = lambda name, value: lambda key, *_: keys.update({name: jax.random.key_data(key)}) or value
+    example = jax.tree.map(lambda x: x[0], source.batch_at(0))
+    views = example.targets
+    one = lambda rgb, alpha: Rendering(rgb, alpha, alpha, jnp.zeros((), jnp.int32))
+    rendering = jax.vmap(one)(views.images, views.masks)
+    outputs = SimpleNamespace(dropped_tokens=jnp.zeros((), jnp.int32))
+    monkeypatch.setattr(step, "augment", take("augment", example))
+    monkeypatch.setattr(step, "random_backgrounds", take("backgrounds", jnp.ones((len(views.images), 3))))
+    monkeypatch.setattr(step, "reconstruct_example", lambda *_: (outputs, {}))
+    monkeypatch.setattr(step, "draw_targets", lambda *_: Drawn(rendering))
+    config = dataclasses.replace(CONFIG, augmentation=Augmentation(share=0.5))
+    inspect.unwrap(step.subject_loss)({}, {}, body, example, jax.random.key(0), config)
+    assert set(keys) == {"augment", "backgrounds"} and not np.array_equal(*keys.values())

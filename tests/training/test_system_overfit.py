@@ -7,9 +7,9 @@ import pytest
 from system_cases import small_system
 
 from experiments.systems import ONE_PHOTO
+from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from target_cases import DRIVEN, PIXELS, small
 
+from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, standardize
 from humangs_jax.evaluation.cases import Case
 from humangs_jax.evaluation.run import evaluate
-from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.weights import load_weights
 from humangs_jax.training import validation
-from humangs_jax.training.config import LossConfig, TrainConfig, tiny
+from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig, tiny
 from humangs_jax.training.loop import train
-from humangs_jax.training.optimizer import OptimizerConfig
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 

@@ -54,7 +54,7 @@ def main():
         jax.config.update("jax_compilation_cache_dir", arguments.cache)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     if arguments.coordinator:
-        from humangs_jax.training.processes import join_processes
+        from humangs_jax.training.sharding import join_processes
 
         join_processes(arguments.coordinator, arguments.processes, arguments.process)
     from training_cases import tube

@@ -22,7 +22,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.residuals.boundaries import Boundary, inside_image
 from humangs_jax.fitting.solve import robust
-from humangs_jax.network.bilinear import sample_bilinear
+from humangs_jax.network.maps import sample_bilinear
 
 LOOKS = 129
 """Samples along a normal: half a pixel apart in the first round, less later."""

@@ -23,27 +23,24 @@ MARGIN = 0.95
 
 @configuration
 class SurfaceMap:
-    """A map of the surface.
-
-    kind: "atlas": the texture coordinates of the body, or charts cut for it; every point of the surface once. "front_back":
-    the T-pose seen from the front, and beside it, mirrored, from the back, by parallel rays. size: texels a side; "front_back" is
-    twice as wide.
-    """
+    """A map of the surface."""
 
     kind: Literal["atlas", "front_back"] = "atlas"
+    """The texture coordinates of the body, or charts cut for it, with every point of the surface once ("atlas"); or the T-pose
+    seen from the front, and beside it, mirrored, from the back, by parallel rays ("front_back")."""
     size: Side = 512
+    """Texels a side; "front_back" is twice as wide."""
 
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width."""
         return self.size, self.size * (2 if self.kind == "front_back" else 1)
 
-
-def surface_texels(body: BodyModel, wanted: SurfaceMap) -> Texels:
-    """The map of a body, on the host; texels that show nothing have no weights. Equal bodies share it: it takes seconds."""
-    plain = lambda x, dtype: None if x is None else np.asarray(x, dtype).tobytes()
-    uvs = plain(body.uvs, np.float32), plain(body.uv_faces, np.int32)
-    return _texels(plain(body.template, np.float32), plain(body.faces, np.int32), *uvs, wanted)
+    def texels(self, body: BodyModel) -> Texels:
+        """Of a body, on the host; texels that show nothing have no weights. Equal bodies share them: they take seconds."""
+        plain = lambda x, dtype: None if x is None else np.asarray(x, dtype).tobytes()
+        uvs = plain(body.uvs, np.float32), plain(body.uv_faces, np.int32)
+        return _texels(plain(body.template, np.float32), plain(body.faces, np.int32), *uvs, self)
 
 
 @functools.lru_cache(maxsize=8)
