@@ -12,7 +12,8 @@ from typing import Any, Literal, TypeVar
 from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 
 # Cameras and keypoints --------------------------------------------------------------------------------------------------
-# The module of a row has two functions; where several recognize a file, the first one reads it.
+# The module of a row has two functions; where several recognize a file, the first reads it, those of its suffix before others.
+# Suffixes are for files that are neither JSON nor text.
 #     recognizes(source) -> bool            whether the content of a file is of this format; not asked where `folder` is set
 #     read(source, format) -> Calibration   or Detections; source: `calibration.Source`, `keypoints.keypoints.Source`
 
@@ -76,8 +77,9 @@ class SourceFormats(Formats[F]):
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
-        """The first format that recognizes a source, a file."""
-        return next((each for each in self.values() if each.fits(source)), None)
+        """The first format that recognizes a source, a file; those of its suffix are asked before the others."""
+        asked = sorted(self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes)
+        return next((each for each in asked if each.fits(source)), None)
 
     def listed(self) -> str:
         """All in one line."""
@@ -126,6 +128,7 @@ KEYPOINTS = SourceFormats(
     humangs=SourceFormat(
         "humangs detect",
         _KEYPOINTS + "own:read",
+        suffixes=(".npz",),
         files=("keypoints.json", "keypoints.npz"),
         content="33 points of BlazePose; `save_keypoints` (.npz): any set",
     ),

@@ -10,6 +10,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json, file_numbers
+from humangs_jax.data.formats import KEYPOINTS
 from humangs_jax.data.keypoints.sets import SETS_BY_COUNT, KeypointSet
 
 LISTED = 5
@@ -99,8 +100,8 @@ class Source:
 
     @functools.cached_property
     def json(self) -> Any:
-        """The value of the file, None for an npz archive. Raises: CaptureError."""
-        return None if self.path.suffix == ".npz" else checked_json(self.path)
+        """The value of the file, None where its suffix is that of another format. Raises: CaptureError."""
+        return None if self.path.suffix.lower() in KEYPOINTS.suffixes else checked_json(self.path)
 
 
 def detections_of(images: Sequence[DetectedImage]) -> Detections:

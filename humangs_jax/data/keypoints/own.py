@@ -35,12 +35,12 @@ DECIMALS = 4
 
 def recognizes(source: Source) -> bool:
     """Whether a file is one of ours; npz archives are taken for one."""
-    return source.path.suffix == ".npz" or _is_people_file(source.json)
+    return source.path.suffix.lower() == ".npz" or _is_people_file(source.json)
 
 
 def read(source: Source, format: SourceFormat) -> Detections:
     """The keypoints of one person, or all people, with confidence 0 where they are not in the image. Raises: CaptureError."""
-    if source.path.suffix == ".npz":
+    if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
     nobody = np.zeros((len(kind.names), 3))
