@@ -57,15 +57,20 @@ CHANGES = {
         lambda c: {"poses": replace(c.poses, rotations=jnp.degrees(c.poses.rotations))},
         "the poses seem to be in degrees: rotations up to 81, expected radians",
     ),
-    "camera to world": (
-        lambda c: {"cameras": replace(c.cameras, cam_from_world=jnp.linalg.inv(c.cameras.cam_from_world))},
-        "if cam_from_world is the inverse",
-    ),
-    "millimetres": (
+    "no metres": (
         lambda c: {"poses": replace(c.poses, translation=c.poses.translation * 1000 + 500)},
         "most of the body is outside the frame",
     ),
 }
+FLIP, Z_UP = np.diag([1.0, -1, -1, 1]), np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+MADE = {
+    "is the inverse": np.linalg.inv,
+    "looks along -z": lambda m: FLIP @ m,
+    "camera to world in OpenGL": lambda m: np.linalg.inv(FLIP @ m),
+    "camera's translation is in millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]),
+    "a world with z up": lambda m: m @ Z_UP,
+}
+"""What people do to a right cam_from_world, and what is said of it."""
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -80,10 +85,26 @@ def test_right_captures_have_no_warnings(right):
     assert likely_mistakes(dataclasses.replace(right, masks=None)) == ()
 
 
-def test_without_masks_only_what_is_out_of_the_frame_is_seen(right):
-    inverse = replace(right.cameras, cam_from_world=jnp.linalg.inv(right.cameras.cam_from_world))
-    (found,) = likely_mistakes(dataclasses.replace(right, masks=None, cameras=inverse))
-    assert "outside the frame, or behind the camera; it would fit if cam_from_world is the inverse" in found
+@pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.parametrize("mistake", MADE)
+def test_wrong_cameras_are_explained(mistake, masks, right):
+    """Without masks only where nothing else puts the body into the frame."""
+    wrong = np.stack([MADE[mistake](np.asarray(matrix, float)) for matrix in right.cameras.cam_from_world])
+    cameras = replace(right.cameras, cam_from_world=jnp.asarray(wrong, jnp.float32))
+    capture = dataclasses.replace(right, cameras=cameras, masks=right.masks if masks else None)
+    found = likely_mistakes(capture)
+    explained = [line for line in found if "it would fit if" in line]
+    assert all(mistake in line for line in explained) and (len(explained) == len(found) > 0 or not masks)
+
+
+def test_a_body_in_millimetres_is_explained(right):
+    offset = np.asarray([400.0, 300.0, 200.0], np.float32)
+    back = np.eye(4)
+    back[:3, 3] = -offset / 1000
+    poses = replace(right.poses, translation=jnp.asarray(np.asarray(right.poses.translation) * 1000 + offset))
+    cameras = replace(right.cameras, cam_from_world=right.cameras.cam_from_world @ jnp.asarray(back, jnp.float32))
+    (found,) = likely_mistakes(dataclasses.replace(right, poses=poses, cameras=cameras))
+    assert "the body's translation is in millimetres" in found
 
 
 def test_the_points_lie_on_the_body(right):
