@@ -45,9 +45,6 @@ def flat(values):
     return values.reshape(-1).tolist()
 
 
-# OpenPose ------------------------------------------------------------------------------------------------------------
-
-
 def openpose_person(values, hands=True, face=False):
     person = {"person_id": [-1], "pose_keypoints_2d": flat(values[:25]), "face_keypoints_2d": [1.0] * 210 * face}
     person |= {"hand_left_keypoints_2d": flat(values[25:46]) if hands else []}
@@ -58,12 +55,66 @@ def openpose(*people):
     return {"version": 1.3, "people": list(people)}
 
 
-@pytest.mark.parametrize("face", [False, True])
-def test_openpose_folder(tmp_path, face):
-    values = known(67)
-    for name, each in zip(NAMES, values, strict=True):
-        write(tmp_path / f"{name}_keypoints.json", openpose(openpose_person(each, face=face)))
-    check(read(tmp_path), values, OPENPOSE_67)
+def instances(values):
+    return [{"keypoints": values[:, :2].tolist(), "keypoint_scores": values[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]}]
+
+
+def frames(values, first=0):
+    return [{"frame_id": i, "instances": instances(each)} for i, each in enumerate(values, first)]
+
+
+def demo(content):
+    """As MMPose's demo scripts write it."""
+    return {"meta_info": {"dataset_name": "coco"}, "instance_info": content}
+
+
+OF_NAMES = lambda values: zip(NAMES, values, strict=True)
+OF_CAMERAS = lambda values: ((i // 2, i % 2, each) for i, each in enumerate(values))
+VIDEO = ("f_0000", "f_0001", "f_0002")
+FOLDERS = {
+    "OpenPose": (
+        OPENPOSE_67,
+        NAMES,
+        lambda v: {f"{n}_keypoints": openpose(openpose_person(x)) for n, x in OF_NAMES(v)},
+    ),
+    "OpenPose with faces": (
+        OPENPOSE_67,
+        NAMES,
+        lambda v: {f"{n}_keypoints": openpose(openpose_person(x, face=True)) for n, x in OF_NAMES(v)},
+    ),
+    "OpenPose of videos": (
+        OPENPOSE_67,
+        CAMERA_NAMES,
+        lambda v: {f"cam{c}_{f:012d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)},
+    ),
+    "OpenPose in a folder for each camera": (
+        OPENPOSE_67,
+        CAMERA_NAMES,
+        lambda v: {f"cam{c}/{f:06d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)},
+    ),
+    "OpenPose of one image": (OPENPOSE_67, ("front",), lambda v: {"front_keypoints": openpose(openpose_person(v[0]))}),
+    "MMPose": (COCO_17, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
+    "MMPose, whole body": (COCO_WHOLEBODY_133, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
+    "MMPose's demo": (COCO_17, NAMES, lambda v: {f"results_{n}": demo(instances(x)) for n, x in OF_NAMES(v)}),
+    "MMPose of a video": (COCO_17, VIDEO, lambda v: {"walk": frames(v)}),
+    "MMPose's demo of a video": (COCO_17, VIDEO, lambda v: {"walk": demo(frames(v, 1))}),
+    "MMPose of two videos": (
+        COCO_WHOLEBODY_133,
+        CAMERA_NAMES,
+        lambda v: {f"cam{i}": frames(v[2 * i : 2 * i + 2]) for i in (0, 1)},
+    ),
+}
+"""The set, the views, and the files of a folder from the points."""
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_of_files(kind, tmp_path):
+    keypoint_set, names, files = FOLDERS[kind]
+    values = known(len(keypoint_set.names), len(names))
+    written = [write(tmp_path / f"{name}.json", content) for name, content in files(values).items()]
+    check(read(tmp_path, names), values, keypoint_set)
+    if len(written) == 1:
+        check(read(written[0], names), values, keypoint_set)
 
 
 def test_openpose_without_hands(tmp_path):
@@ -76,73 +127,16 @@ def test_openpose_without_hands(tmp_path):
     check(read(tmp_path), values, OPENPOSE_67)
 
 
-def test_openpose_of_several_videos_and_of_one_image(tmp_path):
-    values = known(67, 4)
-    for i in range(4):
-        write(tmp_path / f"cam{i // 2}_{i % 2:012d}_keypoints.json", openpose(openpose_person(values[i])))
-    check(read(tmp_path, CAMERA_NAMES), values, OPENPOSE_67)
-    one = write(tmp_path / "one" / "front_keypoints.json", openpose(openpose_person(values[0])))
-    check(read(one, ("front",)), values[:1], OPENPOSE_67)
-
-
-def test_openpose_in_a_folder_per_camera(tmp_path):
-    values = known(67, 4)
-    for i in range(4):
-        write(tmp_path / f"cam{i // 2}" / f"{i % 2:06d}_keypoints.json", openpose(openpose_person(values[i])))
-    check(read(tmp_path, CAMERA_NAMES), values, OPENPOSE_67)
-
-
-def test_openpose_finds_nobody_in_a_view(tmp_path):
-    values = known(67)
+@pytest.mark.parametrize("tool", ["openpose", "mmpose"])
+def test_nobody_is_found_in_a_view(tool, tmp_path):
+    values = known(67 if tool == "openpose" else 17)
     for name, each in zip(NAMES, values, strict=True):
-        people = [] if name == "back" else [openpose_person(each)]
-        write(tmp_path / f"{name}_keypoints.json", openpose(*people))
+        nobody = name == "back"
+        people = openpose(*[] if nobody else [openpose_person(each)]) if tool == "openpose" else instances(each)
+        write(tmp_path / f"{name}.json", [] if nobody and tool == "mmpose" else people)
     keypoints = read(tmp_path)
     assert keypoints.missing == ("back",) and not keypoints.confidences[1].any()
     np.testing.assert_array_equal(keypoints.points[[0, 2]], values[[0, 2], :, :2] + 0.5)
-
-
-# MMPose --------------------------------------------------------------------------------------------------------------
-
-
-def instances(values):
-    return [{"keypoints": values[:, :2].tolist(), "keypoint_scores": values[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]}]
-
-
-@pytest.mark.parametrize("keypoint_set", [COCO_17, COCO_WHOLEBODY_133])
-@pytest.mark.parametrize("demo", [False, True])
-def test_mmpose_images(tmp_path, keypoint_set, demo):
-    values = known(len(keypoint_set.names))
-    for name, each in zip(NAMES, values, strict=True):
-        if demo:
-            content = {"meta_info": {"dataset_name": "coco"}, "instance_info": instances(each)}
-            write(tmp_path / f"results_{name}.json", content)
-        else:
-            write(tmp_path / f"{name}.json", instances(each))
-    check(read(tmp_path), values, keypoint_set)
-
-
-@pytest.mark.parametrize("first, demo", [(0, False), (1, True)])
-def test_mmpose_video(tmp_path, first, demo):
-    values = known(17)
-    frames = [{"frame_id": i, "instances": instances(each)} for i, each in enumerate(values, first)]
-    content = {"meta_info": {}, "instance_info": frames} if demo else frames
-    check(read(write(tmp_path / "walk.json", content), ("f_0000", "f_0001", "f_0002")), values, COCO_17)
-
-
-def test_mmpose_videos_of_two_cameras(tmp_path):
-    values = known(133, 4)
-    for camera in (0, 1):
-        frames = [{"frame_id": i, "instances": instances(values[2 * camera + i])} for i in (0, 1)]
-        write(tmp_path / f"cam{camera}.json", frames)
-    check(read(tmp_path, CAMERA_NAMES), values, COCO_WHOLEBODY_133)
-
-
-def test_mmpose_image_without_people(tmp_path):
-    values = known(17)
-    for name, each in zip(NAMES, values, strict=True):
-        write(tmp_path / f"{name}.json", [] if name == "left" else instances(each))
-    assert read(tmp_path).missing == ("left",)
 
 
 # COCO ----------------------------------------------------------------------------------------------------------------
