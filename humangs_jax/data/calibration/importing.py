@@ -14,7 +14,7 @@ from typing import get_args
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
@@ -29,9 +29,9 @@ from humangs_jax.data.calibration.checks import Checks, check_calibration, check
 from humangs_jax.data.calibration.photos import (
     Photo,
     Turn,
-    find_photo,
     find_photos,
     find_turns,
+    photo_of,
     photo_size,
     turn_notes,
     turned_cameras,
@@ -134,7 +134,7 @@ def import_cameras(
     _check_options(scale, up, pixel_centers, every, frames)
     _check_folders(source, images, masks, out, overwrite)
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
-        calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
+        calibration = read_calibration(source, lambda name: photo_size(photo_of(images, name, source)))
         return import_calibration(
             calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers
         )
@@ -244,13 +244,6 @@ def _check_folders(source: Path, images: Path, masks: Path | None, out: Path, ov
     for path in (source, images, masks):
         if path is not None and inside(path):
             raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
-
-
-def _size_by_name(images: Path, name: str, source: Path) -> tuple[int, int]:
-    photo = find_photo(images, name)
-    if photo is None:
-        raise CaptureError(source, name, f"no such photo (PNG or JPEG) in {images}")
-    return photo_size(photo)
 
 
 def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
@@ -373,7 +366,10 @@ def _rewrite(
         mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
-    at_rim = mask is not None and _reaches(mask > MASK_THRESHOLD, canvas)
+    at_rim = False
+    if mask is not None:
+        person, (height, width) = mask > MASK_THRESHOLD, mask.shape
+        at_rim = (width < canvas[0] and person[:, -1].any()) or (height < canvas[1] and person[-1].any())
     image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
     files = {"image": f"images/{name}.png"}
     write_png(folder / files["image"], image)
@@ -381,13 +377,7 @@ def _rewrite(
         files["mask"] = f"masks/{name}.png"
         (folder / "masks").mkdir(exist_ok=True)
         write_png(folder / files["mask"], mask)
-    return files, at_rim
-
-
-def _reaches(person: Bool[np.ndarray, "h w"], canvas: tuple[int, int]) -> bool:
-    """Whether there is anybody at the right or lower rim of (h, w), on the side where it is smaller than the canvas."""
-    height, width = person.shape
-    return bool((width < canvas[0] and person[:, -1].any()) or (height < canvas[1] and person[-1].any()))
+    return files, bool(at_rim)
 
 
 def _padded(

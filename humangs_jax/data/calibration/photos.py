@@ -88,6 +88,13 @@ def find_photo(folder: Path, name: str) -> Path | None:
     return photo
 
 
+def photo_of(folder: Path, name: str, file: Path) -> Path:
+    """The photo that a file names, see `find_photo`. Raises: CaptureError if there is none."""
+    if (photo := find_photo(folder, name)) is None:
+        raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
+    return photo
+
+
 def _check_inside(folder: Path, name: str | Path) -> None:
     with reading(folder, "path", CaptureError):
         inside(folder, str(name), photo=True)
@@ -115,9 +122,7 @@ def _of_images(images: Path, names: Sequence[str], file: Path) -> list[tuple[int
     """(camera, photo) where each image has a camera of its own."""
     photos: dict[Path, str] = {}
     for name in names:
-        photo = find_photo(images, name)
-        if photo is None:
-            raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {images}")
+        photo = photo_of(images, name, file)
         if photo in photos:
             raise CaptureError(file, name, f"{photo} is the photo of {photos[photo]} already: expected one for each")
         photos[photo] = name
@@ -139,7 +144,15 @@ def _mask(masks: Path, images: Path, image: Path) -> Path:
 def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
     """(camera, frame, photo) where each camera took one photo or several."""
     names = [camera.name for camera in calibration.cameras]
-    layouts = (_folders_of_cameras(images, names), _folders_of_frames(images, names), _single_photos(images, names))
+    for name in names:  # of a file: "../.." would be any folder
+        _check_inside(images, name)
+    of_frame = {folder.name: _photos_in(folder) for folder in images.iterdir() if folder.is_dir()}
+    alone = _photos_in(images)
+    layouts: tuple[list[dict[str, Path]], ...] = (
+        [_photos_in(images / name) for name in names],
+        [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names],
+        [{"": alone[name]} if name in alone else {} for name in names],
+    )
     frames_of = next((layout for layout in layouts if any(layout)), None)
     if frames_of is None:
         shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
@@ -152,28 +165,10 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
     return sorted(found, key=lambda entry: (entry[1], entry[0]))
 
 
-def _folders_of_cameras(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
-    """For each camera, frame name -> photo."""
-    for name in names:  # of a file: "../.." would be any folder
-        _check_inside(images, name)
-    return [{p.stem: p for p in _photos_in(images / name)} for name in names]
-
-
-def _folders_of_frames(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
-    folders = [entry for entry in images.iterdir() if entry.is_dir()]
-    of_frame = {folder.name: {p.stem: p for p in _photos_in(folder)} for folder in folders}
-    return [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names]
-
-
-def _single_photos(images: Path, names: Sequence[str]) -> list[dict[str, Path]]:
-    photos = {p.stem: p for p in _photos_in(images)}
-    return [{"": photos[name]} if name in photos else {} for name in names]
-
-
-def _photos_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return [Path(entry.path) for entry in os.scandir(folder) if is_photo(Path(entry.name)) and entry.is_file()]
+def _photos_in(folder: Path) -> dict[str, Path]:
+    """By name without suffix."""
+    entries = os.scandir(folder) if folder.is_dir() else ()
+    return {Path(e.name).stem: Path(e.path) for e in entries if is_photo(Path(e.name)) and e.is_file()}
 
 
 def _in_order(names: Iterable[str]) -> list[str]:

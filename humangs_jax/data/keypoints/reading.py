@@ -291,7 +291,8 @@ def _split_number(name: str) -> tuple[str, int | None]:
 
 def _match_path(path: PurePosixPath, names: Sequence[str]) -> int | None:
     """The view of a file name with as many of its folders as fit; then with numbers compared as numbers."""
-    keys = [_as_name("_".join(path.parts[i:])) for i in range(len(path.parts))]
+    # the names of views are made from paths in this way
+    keys = [re.sub(r"[^\w.-]", "_", "_".join(path.parts[i:])).lstrip("._") for i in range(len(path.parts))]
     plain = [_plain(name) for name in names]
     for key in keys:
         if key in names:
@@ -307,8 +308,10 @@ def _match_path(path: PurePosixPath, names: Sequence[str]) -> int | None:
 def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, int]:
     """The views of image numbers, by the last number in the names of the views."""
     of_view = {i: int(found[-1]) for i, name in enumerate(names) if (found := re.findall(r"\d+", name))}
-    shift = _shift(sorted(set(numbers)), sorted(of_view.values()), len(names))
-    matched = {}
+    shift, matched = 0, {}
+    known, wanted, count = sorted(set(numbers)), sorted(of_view.values()), len(names)
+    if known and all(each == list(range(each[0], each[0] + count)) for each in (known, wanted) if each):
+        shift = wanted[0] - known[0] if len(wanted) == count else 0
     for number in set(numbers):
         views = [i for i, value in of_view.items() if value == number + shift]
         if len(views) > 1:
@@ -317,18 +320,6 @@ def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, in
         if views:
             matched[number] = views[0]
     return matched
-
-
-def _shift(numbers: list[int], of_views: list[int], views: int) -> int:
-    if not numbers or len(numbers) != views or len(of_views) != views:
-        return 0
-    without_gaps = all(each == list(range(each[0], each[0] + views)) for each in (numbers, of_views))
-    return of_views[0] - numbers[0] if without_gaps else 0
-
-
-def _as_name(text: str) -> str:
-    """The name of a view that is made from such a path."""
-    return re.sub(r"[^\w.-]", "_", text).lstrip("._")
 
 
 def _plain(name: str) -> str:
