@@ -1,23 +1,26 @@
-"""docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself.
+"""docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself."""
 
-    python experiments/knobs.py [--check]
-
-A knob is a field made by `humangs_jax.core.configuration.knob`. --check writes nothing; exit status 1 if the page differs.
-"""
-
-import argparse
 import dataclasses
-import sys
-from pathlib import Path
 from typing import Any
 
-REPOSITORY = Path(__file__).parents[1]
-sys.path.insert(0, str(REPOSITORY))
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY
+from humangs_jax.apps.settings import PRESETS, Settings
+from humangs_jax.network.config import Conventions
+from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.runtime import Runtime
+from humangs_jax.network.vertex_decoder import VertexDecoder
+from humangs_jax.people.on_the_fly import OnTheFlyConfig
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.rendering.mesh.rasterizer import RasterConfig
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.training.config import TrainConfig
+
 PAGE = REPOSITORY / "docs" / "knobs.md"
 HEAD = """# Knobs
 
 Every setting of the network, the renderer, the training step and the people on the fly that trades accuracy or memory for speed.
-`experiments/knobs.py` writes this page from the code. Decibels compare with the exact image; times are shares of the default's.
+`python -m experiments knobs` writes this page. Decibels compare with the exact image; times are shares of the default's.
 The linked page has the measurement and its conditions.
 
 | knob | default | costs | buys | measured in |
@@ -35,17 +38,6 @@ PRESETS_HEAD = """
 
 def page() -> str:
     """The page in Markdown."""
-    from humangs_jax.apps.settings import Settings
-    from humangs_jax.network.config import Conventions
-    from humangs_jax.network.encoder import PatchTransformer
-    from humangs_jax.network.runtime import Runtime
-    from humangs_jax.network.vertex_decoder import VertexDecoder
-    from humangs_jax.people.on_the_fly import OnTheFlyConfig
-    from humangs_jax.refinement.config import RefineConfig
-    from humangs_jax.rendering.mesh.rasterizer import RasterConfig
-    from humangs_jax.rendering.splat_config import SplatConfig
-    from humangs_jax.training.config import TrainConfig
-
     classes = (
         Runtime,
         Conventions,
@@ -64,8 +56,6 @@ def page() -> str:
 
 def preset_rows() -> list[str]:
     """A row for each preset: what differs from the defaults."""
-    from humangs_jax.apps.settings import PRESETS, Settings
-    from humangs_jax.network.runtime import Runtime
 
     def changes(value: Any, usual: Any) -> list[str]:
         names = [field.name for field in dataclasses.fields(value) if field.name != "runtime"]
@@ -93,17 +83,7 @@ def knob_rows(cls: Any) -> list[str]:
     return rows
 
 
-def main() -> int:
-    """Command line; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare instead of writing")
-    arguments = parser.parse_args()
-    text = page()
-    if arguments.check:
-        return int(text != PAGE.read_text())
-    PAGE.write_text(text)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+@entry
+def knobs(run: Run) -> None:
+    """Writes docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself."""
+    PAGE.write_text(page())

@@ -405,7 +405,7 @@ def main() -> None:
 
     import jax
 
-    from experiments.common.results import write_json
+    from experiments.results import write_json
 
     jax.config.update("jax_enable_x64", arguments.dtype == "float64")
     try:

@@ -21,6 +21,7 @@ CASES = {
     "masks": PEOPLE,
     "paper_claims": "",
     "people_faults": "--subjects 1 --described 20 --size 64 --plots FOLDER/a.png",
+    "video": "--size 64 --repeats 1 --image FOLDER/a.jpg",
     "reconstruction_benchmark": "--preset tiny --size 64 --views 2 --repeats 1 --memory 1 --memory-size 64",
     "reconstruction_savings": "--preset tiny --size 64 --views 2 --repeats 1",
     "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",
@@ -43,7 +44,7 @@ LAST = {
 
 @pytest.fixture(autouse=True)
 def restored_options():
-    names = ("jax_enable_x64", "jax_enable_compilation_cache", "jax_disable_most_optimizations", "jax_platforms")
+    names = ("jax_enable_x64", "jax_enable_compilation_cache", "jax_platforms")
     before = {name: getattr(jax.config, name) for name in names}
     yield
     for name, value in before.items():

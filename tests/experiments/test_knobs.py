@@ -6,7 +6,7 @@ from experiments.knobs import PAGE, REPOSITORY, page
 
 
 def test_the_page_of_knobs_is_up_to_date():
-    assert page() == PAGE.read_text(), "run experiments/knobs.py"
+    assert page() == PAGE.read_text(), "run `python -m experiments knobs`"
 
 
 def test_its_links_lead_somewhere():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from experiments.evaluation.real_cameras import camera_errors, seen_from, to_reference
-from experiments.evaluation.real_capture import VideoCamera, background, careful_mask, read_cameras
-from experiments.evaluation.real_rows import Results, section
+from experiments.real_cameras import camera_errors, seen_from, to_reference
+from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
+from experiments.real_person import Results, section
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 

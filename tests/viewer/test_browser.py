@@ -13,7 +13,7 @@ from bvh_files import CMU, MIXAMO, rest_frames, write_bvh
 from scipy.spatial.transform import Rotation
 
 from experiments import chromium
-from experiments.evaluation import page as evaluation
+from experiments import page as evaluation
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import joint_transforms

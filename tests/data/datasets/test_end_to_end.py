@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.data import made_up
+from experiments import made_up
 from experiments.your_photos import landmarks_in
 from humangs_jax import cli
 from humangs_jax.apps.check import check_capture

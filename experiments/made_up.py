@@ -1,23 +1,31 @@
-"""Synthetic people in the layouts of real data sets, for tests, documentation and benchmarks.
+"""Synthetic people in the layouts of real data sets, with the package's body as an SMPL-X file."""
 
-    python experiments/data/made_up.py thuman avatarrex thuman4 actorshq dna --out DIR [--people 2]
-
-DIR/body.npz is the body of the package as an SMPL-X model file; DIR/LAYOUT holds the data set. The real ones need a licence.
-Person i of the file has the shape coefficient i at 1 and all others at 0. About a minute a layout on 2 CPU cores.
-"""
-
-import argparse
 import csv
+import dataclasses
+import importlib
+import io
 import json
 import pickle
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.harness import Run, entry
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_people, turned
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.io.images import to_uint8
+from humangs_jax.people.baking import bake_subject, lit_texture
+from humangs_jax.people.rendering import pose_subject, render_view
+from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import describe, make_subject
+from humangs_jax.people.writer import sample_motion, sample_pose
 
 SEEDS = (3_000_271, 3_000_584)
 """People who are written, of the split "demo"."""
@@ -68,9 +76,6 @@ def write_body(path: Path, people: Sequence[Any], body: Any, hand_poses: np.ndar
 
 def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list[Any], Any, Any]:
     """Synthetic people, the body that they are made of, and the one of the model file: decimated to `vertices`."""
-    from humangs_jax.body.decimation import decimate
-    from humangs_jax.body.library import load_body
-
     body = load_body()
     return (
         [in_tight_clothes(seed, body) for seed in seeds],
@@ -81,11 +86,6 @@ def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list
 
 def in_tight_clothes(seed: int, body: Any) -> Any:
     """The person of a seed in `TIGHT` clothes of other people of the documentation, with hair that is buzzed."""
-    import dataclasses
-
-    from humangs_jax.people.seeds import DEMO
-    from humangs_jax.people.subject import describe, make_subject
-
     person, wanted, garments, haircut = describe(seed, body), set(TIGHT), {}, None
     for other in DEMO:
         seen = describe(other, body)
@@ -104,8 +104,6 @@ def in_tight_clothes(seed: int, body: Any) -> Any:
 
 def fitted_vertices(body_file: Path, parameters: Any) -> np.ndarray:
     """(n, 3) vertices of the model file in the first pose."""
-    from humangs_jax.data.datasets.bodies import FileBody, posed_people
-
     return next(posed_people(FileBody.load(body_file).model, parameters)).vertices
 
 
@@ -124,10 +122,6 @@ def write_thuman(
 
     Scans stand in a world of their own: turned, moved, and in other units for each person.
     """
-    from humangs_jax.data.datasets.bodies import BodyParameters, turned
-    from humangs_jax.people.baking import bake_subject, lit_texture
-    from humangs_jax.people.writer import sample_pose
-
     people, _, small = make_people(seeds, vertices)
     posed = [sample_pose(person, 1) for person in people]
     hands = np.stack([[p.rotations[part].reshape(-1) for part in HANDS] for p in posed])
@@ -151,8 +145,6 @@ def write_thuman(
 
 def random_rigid(rng: np.random.Generator) -> np.ndarray:
     """A turn by up to a radian about any axis, and up to a metre."""
-    from scipy.spatial.transform import Rotation
-
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)).as_matrix()
     matrix[:3, 3] = rng.uniform(-1, 1, 3)
@@ -188,8 +180,6 @@ def write_scan(
     folder: Path, name: str, points: np.ndarray, uvs: np.ndarray, faces: np.ndarray, texture: np.ndarray
 ) -> None:
     """NAME.obj, material0.mtl and material0.jpeg."""
-    from PIL import Image
-
     folder.mkdir(parents=True)
     lines = ["mtllib material0.mtl"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in points.tolist()]
@@ -211,10 +201,6 @@ class Video:
     """
 
     def __init__(self, out: Path, seed: int, frames: int, cameras: int, size: tuple[int, int], vertices: Any):
-        from humangs_jax.data.datasets.bodies import BodyParameters, turned
-        from humangs_jax.people.rendering import pose_subject
-        from humangs_jax.people.writer import sample_motion
-
         people, _, small = make_people([seed], vertices)
         motion = sample_motion(people[0], 30, "walk")
         rows = np.linspace(0, 29, frames).round().astype(int)
@@ -238,10 +224,6 @@ class Video:
         self.K = np.asarray(self.cameras[0].K, np.float64)
 
     def _around(self, count, size):
-        import jax.numpy as jnp
-
-        from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-
         low = np.stack([p.vertices.min(0) for p in self.posed]).min(0)
         high = np.stack([p.vertices.max(0) for p in self.posed]).max(0)
         width, height = size
@@ -253,11 +235,6 @@ class Video:
 
     def write(self, place: Callable[[int, int], tuple[Path, ...]], background: float = BACKGROUND):
         """Photos and masks at place(camera, frame)."""
-        from PIL import Image
-
-        from humangs_jax.io.images import to_uint8
-        from humangs_jax.people.rendering import render_view
-
         for c, camera in enumerate(self.cameras):
             for f, posed in enumerate(self.posed):
                 image, mask = render_view(posed, camera, background)
@@ -339,8 +316,6 @@ def write_actorshq(
     vertices: Any = None,
 ) -> Path:
     """out/body.npz and out/Actor01/Sequence1 at scale 4x; returns the sequence's folder."""
-    from scipy.spatial.transform import Rotation
-
     video, folder = Video(out, seed, frames, cameras, size, vertices), out / "Actor01" / "Sequence1"
     names = [f"Cam{i + 1:03d}" for i in range(cameras)]
 
@@ -377,14 +352,6 @@ def write_dna(
     enlarged: how many pixels a side each rendered one becomes. lens: k1 k2 p1 p2 k3 that the file names, for measuring what
     undistortion takes; photos are rendered without.
     """
-    import importlib
-    import io
-
-    from PIL import Image
-
-    from humangs_jax.io.images import to_uint8
-    from humangs_jax.people.rendering import render_view
-
     h5py: Any = importlib.import_module("h5py")
     video, folder = Video(out, seed, frames, cameras, size, vertices), out / "dna"
     means = np.load(out / "body.npz")
@@ -439,17 +406,17 @@ WRITERS: dict[str, Callable[..., Path]] = {
 }
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("layouts", nargs="+", choices=WRITERS, help="what to write")
-    parser.add_argument("--out", type=Path, required=True, help="folder of one folder for each layout")
-    parser.add_argument("--people", type=int, default=2, help="scans of thuman")
-    arguments = parser.parse_args()
-    for layout in arguments.layouts:
-        options = {"seeds": range(SEEDS[0], SEEDS[0] + arguments.people)} if layout == "thuman" else {}
-        print(WRITERS[layout](arguments.out / layout, **options))
+@entry
+def made_up(run: Run, layouts: tuple[str, ...], out: Path = Path("made_up"), people: int = 2) -> None:
+    """Writes synthetic people in the layouts of real data sets.
 
-
-if __name__ == "__main__":
-    main()
+    Options:
+    layouts: of thuman, avatarrex, thuman4, actorshq, dna
+    out: folder of one folder for each layout
+    people: scans of thuman
+    """
+    if unknown := set(layouts) - set(WRITERS):
+        raise ValueError(f"{unknown.pop()}: expected some of {', '.join(WRITERS)}")
+    for layout in layouts:
+        options = {"seeds": range(SEEDS[0], SEEDS[0] + people)} if layout == "thuman" else {}
+        print(WRITERS[layout](out / layout, **options))

@@ -1,30 +1,24 @@
-"""How fast each data set is read, against what training takes; how long preprocessing takes; whether memory stays flat.
+"""How fast each data set is read, against what training takes; how long preprocessing takes; whether memory stays flat."""
 
-    python experiments/data/benchmark.py --json sources.json [--page docs/datasets.md] [--samples 20] [--flat 1000]
-
-Synthetic people are written in each layout with photos of the real sizes, read through the loader (4 input and 3 target views at
-256 pixels a sample, nothing kept in memory), and preprocessed. Memory: growth of the resident set of this process after the first
-fifth of --flat samples of two views (videos: of photos a fifth as wide, which take a twentieth of the time), and of --flat-photos
-of the real size. CPU seconds count the work of all threads and depend little on other programs. About 15 minutes on 2 CPU cores.
-
-An earlier --json is continued: --sources and --parts say what is measured anew. DNA-Rendering is left out without h5py.
-"""
-
-import argparse
+import functools
 import importlib.util
 import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, publish, significant, write_json
-from experiments.data import made_up
-from experiments.timing import prepare_process
+from PIL import Image
+
+from experiments import made_up
+from experiments.harness import Run, entry
+from experiments.results import markdown_table, significant
+from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, ViewSampling
+from humangs_jax.data.preprocess.run import Settings, preprocess
 
 INPUTS, TARGETS, SIZE = 4, 3, 256
 REAL_SIZES = {"avatarrex": (1500, 2048), "thuman4": (1330, 1150), "actorshq": (750, 1022)}
@@ -45,7 +39,6 @@ PREPROCESSED = {
     "avatarrex": "a photo of AvatarReX",
     "thuman4": "a photo of THuman4.0",
 }
-PARTS = ("preprocessing", "reading", "memory", "small")
 
 
 def spent(work: Callable[[], object]) -> dict[str, float]:
@@ -67,8 +60,6 @@ def have_h5py() -> bool:
 
 def enlarge(folder: Path, size: tuple[int, int]) -> None:
     """Photos and masks to their real size, and the calibration with them."""
-    from PIL import Image
-
     for path in [*folder.rglob("*.jpg"), *folder.rglob("*.png")]:
         with Image.open(path) as image:
             larger = image.resize(size)
@@ -105,8 +96,6 @@ def measure_preprocessing(
     out: Path, sets: dict[str, tuple[Path, Path]], kinds: Sequence[str], views: int
 ) -> dict[str, Any]:
     """Seconds for a view of each kind, one process, compilation apart."""
-    from humangs_jax.data.preprocess.run import Settings, preprocess
-
     results = {}
     for kind in kinds:
         every = 10 if kind == "avatarrex" else 1
@@ -124,8 +113,6 @@ def measure_preprocessing(
 
 def examples(people: Any, inputs: int, targets: int, count: int) -> Any:
     """Samples through the loader, one by one."""
-    from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, ViewSampling
-
     sampling = ViewSampling(input_counts=(inputs,), target_count=targets)
     source = CaptureSource(PeopleCache(people, limit_bytes=0), sampling, SIZE, SIZE)
     return Loader(source, seed=1, threads=2).batches(0, count)
@@ -171,63 +158,61 @@ def table(result: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="page whose table data_sources is written")
-    parser.add_argument("--sources", nargs="*", choices=NAMES, default=list(NAMES), help="what is read")
-    parser.add_argument("--parts", nargs="*", choices=PARTS, default=PARTS, help="what is measured")
-    parser.add_argument("--samples", type=int, default=20, help="samples that are timed")
-    parser.add_argument("--flat", type=int, default=1000, help="samples over which memory is watched")
-    parser.add_argument("--flat-photos", type=int, default=100, help="the same of large photos")
-    parser.add_argument("--train-step-s", type=float, default=2.8, help="seconds of a training step (docs/data.md)")
-    parser.add_argument("--views", type=int, default=12, help="views of the scan")
-    arguments = parser.parse_args()
-    if min(arguments.samples, arguments.views) < 1 or min(arguments.flat, arguments.flat_photos) < 50:
-        parser.error("--samples and --views must be at least 1, --flat and --flat-photos at least 50")
-    prepare_process()
-    from humangs_jax.data.datasets.bodies import FileBody
-    from humangs_jax.data.datasets.subject import open_people
+@entry
+def data_sources(
+    run: Run,
+    sources: tuple[str, ...] = tuple(NAMES),
+    samples: int = 20,
+    flat: int = 1000,
+    flat_photos: int = 100,
+    train_step_s: float = 2.8,
+    views: int = 12,
+) -> None:
+    """How fast each data set is read, against what training takes; how long preprocessing takes; whether memory stays flat.
 
-    result: dict[str, Any] = {"train_step_s": arguments.train_step_s, "preprocessing": {}, "sources": {}}
-    if arguments.json and arguments.json.exists():
-        result = json.loads(arguments.json.read_text())
+    Synthetic people are written in each layout with photos of the real sizes, read through the loader (4 input and 3 target
+    views at 256 pixels a sample, nothing kept in memory), and preprocessed. Memory: growth of the resident set of this process
+    after the first fifth of samples of two views (small: of photos a fifth as wide). CPU seconds count the work of all threads.
+    15 minutes.
 
-    def note(name: str, numbers: dict[str, float]) -> None:
-        result["sources"].setdefault(name, {}).update(numbers)
-        print(name, json.dumps(numbers), flush=True)
-        if arguments.json:
-            write_json(arguments.json, result)
-
+    Options:
+    sources: what is read; DNA-Rendering is left out without h5py
+    samples: that are timed
+    flat: samples over which memory is watched
+    flat_photos: the same of large photos
+    train_step_s: seconds of a training step (docs/data.md)
+    views: of the scan
+    """
+    if min(samples, views) < 1 or min(flat, flat_photos) < 50:
+        raise ValueError("--samples and --views must be at least 1, --flat and --flat-photos at least 50")
+    chosen = [name for name in NAMES if name in sources and (name != "dna" or have_h5py())]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
-        sources = [name for name in NAMES if name in arguments.sources and (name != "dna" or have_h5py())]
-        preprocessed = [*PREPROCESSED] if "preprocessing" in arguments.parts else []
-        whole = "reading" in arguments.parts or "memory" in arguments.parts
-        needed = {"thuman" if name == "scenes" else name for name in sources if whole}
-        of_scenes = ["thuman"] if "thuman" in needed and not preprocessed else []
-        sets = {name: write_set(name, out / name, True) for name in needed.union(preprocessed)}
-        made = measure_preprocessing(out, sets, preprocessed or of_scenes, arguments.views)
-        result["preprocessing"].update(made if preprocessed else {})
-        for name in sources:
-            if whole:
-                path, body_file = sets["thuman" if name == "scenes" else name]
-                body, path = FileBody.load(body_file), out / "thuman_scenes" / "test.json" if name == "scenes" else path
-                people = open_people(path, body)
-                if "reading" in arguments.parts:
-                    note(name, measure_reading(people, arguments.samples))
-                if "memory" in arguments.parts:
-                    watched = arguments.flat if name == "scenes" else arguments.flat_photos
-                    note(name, {"grown_bytes": grown_bytes(people, watched), "samples_of_memory": watched})
-            if "small" in arguments.parts and name != "scenes":
-                path, body_file = write_set(name, out / f"{name}_small", False)
-                grown = grown_bytes(open_people(path, FileBody.load(body_file)), arguments.flat)
-                note(name, {"grown_bytes_small": grown, "samples_of_memory_small": arguments.flat})
-    print(table(result))
-    if arguments.page:
-        publish(arguments.page, "data_sources", table(result), result)
 
+        @functools.cache
+        def written(layout, real_size=True):
+            return write_set(layout, out / f"{layout}_{real_size}", real_size)
 
-if __name__ == "__main__":
-    main()
+        @functools.cache
+        def preprocessed():
+            return measure_preprocessing(out, {kind: written(kind) for kind in PREPROCESSED}, list(PREPROCESSED), views)
+
+        def source(name):
+            path, body = written("thuman" if name == "scenes" else name)
+            if name == "scenes":
+                preprocessed()
+                path = out / "thuman_scenes" / "test.json"
+            people, watched = open_people(path, FileBody.load(body)), flat if name == "scenes" else flat_photos
+            row = measure_reading(people, samples) | {"samples_of_memory": watched}
+            row["grown_bytes"] = grown_bytes(people, watched)
+            if name != "scenes":
+                path, body = written(name, False)
+                row["grown_bytes_small"] = grown_bytes(open_people(path, FileBody.load(body)), flat)
+                row["samples_of_memory_small"] = flat
+            return row
+
+        cases = {"preprocessing": preprocessed} | {name: functools.partial(source, name) for name in chosen}
+        rows = run.rows(cases, {"samples": samples, "flat": flat, "flat_photos": flat_photos, "views": views})
+    made = rows.pop("preprocessing")
+    result = {"train_step_s": train_step_s, "preprocessing": made, "sources": rows}
+    run.show(table(result), result)

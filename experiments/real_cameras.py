@@ -11,8 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from experiments.evaluation.real_capture import CAMERAS, SIZE, RealFrame, body_ious, prepare
-from experiments.evaluation.real_person import FRAMES
+from experiments.real_capture import CAMERAS, FRAMES, SIZE, RealFrame, body_ious, prepare
 from humangs_jax.body.library import load_body
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.photos import Photos

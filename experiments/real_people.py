@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
+from experiments.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views

@@ -1,14 +1,23 @@
-"""Author the walk that ships with the package: two strides on the spot with a wave of the right hand, a loop of 2 s.
+"""assets/walk.npz: a walk on the spot with a wave of the hand, by curves of the joints' angles."""
 
-    python experiments/assets/build_motion.py --out humangs_jax/assets/walk.npz [--images folder]
-
-Joint angles over the gait cycle are drawn by hand after textbook curves (hip, knee and ankle flexion, pelvic list and
-rotation, arms against legs); the root is lowered in every frame until the lowest vertex of the default body touches y = 0.
-Takes about 20 s and writes 48 frames at 24 a second, less than 100 KB. With --images also a sheet of frames, front and side.
-"""
-
-import argparse
 from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY
+from humangs_jax.apps.check import draw_body
+from humangs_jax.avatar.sheets import contact_sheet
+from humangs_jax.avatar.video import write_video
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 FRAMES, FPS, STRIDES = 48, 24, 2
 """24 frames a stride: 120 steps a minute, a usual pace."""
@@ -26,32 +35,23 @@ WAVE_BEGIN, WAVE_UP, WAVE_DOWN, WAVE_END = 4, 15, 32, 46
 """Frames: the right arm starts to rise, is up, starts to sink, is down."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("humangs_jax/assets/walk.npz"), help="the motion to write")
-    parser.add_argument("--images", type=Path, help="folder for pictures of the frames")
-    arguments = parser.parse_args()
-    motion = build()
-    from humangs_jax.data.motion import save_motion
+@entry
+def build_motion(run: Run, out: Path = REPOSITORY / "humangs_jax/assets/walk.npz", images: Path | None = None) -> None:
+    """Makes assets/walk.npz.
 
-    save_motion(arguments.out, motion)
-    print(f"{arguments.out}: {len(motion.translations)} frames, {arguments.out.stat().st_size / 1024:.1f} KB")
-    if arguments.images:
-        draw(motion, arguments.images)
+    Options:
+    out: the motion to write
+    images: folder for pictures of the frames
+    """
+    motion = build()
+    save_motion(out, motion)
+    print(f"{out}: {len(motion.translations)} frames, {out.stat().st_size / 1024:.1f} KB")
+    if images:
+        draw(motion, images)
 
 
 def build():
     """The motion: rotations by the curves above, translations by the ground."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.body.joints import JOINT_NAMES
-    from humangs_jax.body.library import load_body
-    from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.data.motion import Motion
-
     body = load_body()
     rest = shape_body(body, jnp.zeros(0))
     rotations = np.zeros((FRAMES, len(JOINT_NAMES), 3))
@@ -73,8 +73,6 @@ def frame_rotations(frame: int) -> dict:
     The T-pose faces +z with its left at +x: a leg or a hanging arm swings forward about -x, a foot lifts about -x, the left
     arm sinks about -z and its elbow bends forward about -y; the right side is the mirror image.
     """
-    import numpy as np
-
     phase = STRIDES * frame / FRAMES
     turn = 2 * np.pi * phase
     once = 2 * np.pi * frame / FRAMES  # what happens once in the whole loop
@@ -120,8 +118,6 @@ def frame_rotations(frame: int) -> dict:
 
 def _waving(frame, shoulder, collar, elbow, wrist):
     """The right arm on its way to and from a wave, and how far the fingers stay curled."""
-    import numpy as np
-
     rise = _smooth((frame - WAVE_BEGIN) / (WAVE_UP - WAVE_BEGIN))
     up = rise * (1 - _smooth((frame - WAVE_DOWN) / (WAVE_END - WAVE_DOWN)))
     wave = np.sin(2 * np.pi * (frame - WAVE_UP) / 9.0)
@@ -143,14 +139,11 @@ def _smooth(x: float) -> float:
 
 def _curve(keys: dict, phase: float) -> float:
     """A periodic cubic spline through {phase: degrees}."""
-    from scipy.interpolate import CubicSpline
-
     times, values = list(keys), list(keys.values())
     return float(CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0))
 
 
 def _rotation(axis: int, degrees: float):
-    import numpy as np
 
     vector = np.zeros(3)
     vector[axis] = np.radians(degrees)
@@ -170,13 +163,11 @@ def _z(degrees: float):
 
 
 def _matrix(axis_angle):
-    from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
 def _axis_angle(matrix):
-    from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(matrix).as_rotvec()
 
@@ -188,15 +179,6 @@ def _between(a, b, share: float):
 
 def draw(motion, folder: Path) -> None:
     """A sheet of every fourth frame, seen from the front left and from the left."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.apps.check import draw_body
-    from humangs_jax.avatar.sheets import contact_sheet
-    from humangs_jax.avatar.video import write_video
-    from humangs_jax.body.library import load_body
-    from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-
     folder.mkdir(parents=True, exist_ok=True)
     size = 256
     cameras = orbit(
@@ -215,7 +197,3 @@ def draw(motion, folder: Path) -> None:
         frames = np.stack(pictures)
         contact_sheet(frames[::3], folder / f"{name}.png", labels=[str(i) for i in range(0, FRAMES, 3)], columns=8)
         write_video(folder / f"{name}.gif", frames, motion.fps)
-
-
-if __name__ == "__main__":
-    main()

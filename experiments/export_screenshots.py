@@ -1,10 +1,5 @@
 """Screenshots of an avatar's page (docs/viewer.md) and of exported files in programs that are not ours (docs/export.md).
 
-    python experiments/assets/export_screenshots.py AVATAR --only viewer
-    npm install --prefix FOLDER playcanvas @sparkjsdev/spark three
-    python -m venv BLENDER && BLENDER/bin/pip install bpy
-    python experiments/assets/export_screenshots.py AVATAR --modules FOLDER/node_modules --blender BLENDER/bin/python
-
 Browser: Chromium with software WebGL. viewer: our page, as `humangs export --html` writes it, in a window of 1280 x 800.
 
 Gaussians: the PlayCanvas engine (SuperSplat's) opens .ply and .glb, Spark .splat and .spz. The mesh: three.js opens .glb, at four
@@ -12,19 +7,28 @@ times of the shipped walk, and .obj. Every page gets files and modules from a se
 Blender (its Python module, a version for the Python at hand) opens both and renders them with Cycles.
 """
 
-import argparse
 import contextlib
 import functools
 import json
 import subprocess
-import sys
 import tempfile
 import threading
+import time
 from collections.abc import Generator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Literal
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+import numpy as np
+from PIL import Image
+
+from experiments import chromium
+from experiments.harness import Run, entry
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.export.files import export
+from humangs_jax.data.motion import load_motion
+from humangs_jax.io.images import read_image
+from humangs_jax.viewer.page import write_page
 
 WIDTH, HEIGHT = 320, 480
 WINDOW, WAIT = (1280, 800), 4.0
@@ -189,52 +193,48 @@ SHEETS = {
 """Screenshots side by side: what it shows, the page, what goes into it."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("avatar", type=Path, help="file written by humangs reconstruct")
-    parser.add_argument("--modules", type=Path, help="folder node_modules with the programs; without it: viewer alone")
-    parser.add_argument("--blender", type=Path, help="a Python that has Blender's module bpy")
-    parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
-    parser.add_argument("--only", choices=("viewer", *sorted(SHEETS)), nargs="*", help="default: all")
-    arguments = parser.parse_args()
-    wanted = (
-        arguments.only if arguments.only is not None else ["viewer", *(sorted(SHEETS) if arguments.modules else ())]
-    )
-    sheets = [name for name in wanted if name in SHEETS]
-    if sheets and arguments.modules is None:
-        parser.error(f"{sheets[0]} needs --modules")
-    from experiments import chromium
+@entry
+def export_screenshots(
+    run: Run,
+    avatar: Path,
+    modules: Path | None = None,
+    blender: Path | None = None,
+    out: Path = Path("docs/images"),
+    only: tuple[Literal["viewer", "export_gaussians", "export_mesh"], ...] = (),
+) -> None:
+    """Screenshots of exported avatars in public programs, and of the viewer.
 
+    Options:
+    avatar: file written by humangs reconstruct
+    modules: folder node_modules with the programs; without it: viewer alone
+    blender: a Python that has Blender's module bpy
+    out: folder for the images
+    only: default: all
+    """
+    wanted = only or ("viewer", *(sorted(SHEETS) if modules else ()))
+    sheets = [name for name in wanted if name in SHEETS]
+    if sheets and modules is None:
+        raise ValueError(f"{sheets[0]} needs --modules")
     if (reason := chromium.missing()) is not None:
-        parser.error(reason)
+        raise ValueError(reason)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if "viewer" in wanted:
-            write_viewer(arguments.out / "viewer.png", folder, arguments.avatar)
-        if sheets or arguments.blender:
-            write_files(folder, arguments.avatar)
-        if arguments.blender is not None:
-            write_blender_sheet(arguments.out / "export_blender.jpg", folder, arguments.blender)
-        if not sheets:
+            write_viewer(out / "viewer.png", folder, avatar)
+        if sheets or blender:
+            write_files(folder, avatar)
+        if blender is not None:
+            write_blender_sheet(out / "export_blender.jpg", folder, blender)
+        if not sheets or modules is None:
             return
-        (folder / "node_modules").symlink_to(arguments.modules.resolve())
+        (folder / "node_modules").symlink_to(modules.resolve())
         with served(folder) as address, chromium.Chromium(WIDTH, HEIGHT) as browser:
             for sheet in sheets:
-                write_sheet(arguments.out / f"{sheet}.jpg", folder, address, browser, SHEETS[sheet])
+                write_sheet(out / f"{sheet}.jpg", folder, address, browser, SHEETS[sheet])
 
 
 def write_viewer(path: Path, folder: Path, avatar: Path) -> None:
     """The page of an avatar a moment after it was opened. Raises: RuntimeError for a page that shows nothing."""
-    import time
-
-    import numpy as np
-    from PIL import Image
-
-    from experiments import chromium
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.viewer.page import write_page
-
     write_page(folder / "avatar.html", Avatar.load(avatar))
     with chromium.Chromium(*WINDOW) as browser:
         browser.open(folder / "avatar.html")
@@ -247,10 +247,6 @@ def write_viewer(path: Path, folder: Path, avatar: Path) -> None:
 
 def write_files(folder: Path, path: Path) -> None:
     """One person in every format."""
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.export.files import export
-    from humangs_jax.data.motion import load_motion
-
     avatar = Avatar.load(path)
     for suffix in (".ply", ".glb", ".splat", ".spz"):
         export(folder / f"person{suffix}", avatar)
@@ -276,8 +272,6 @@ def served(folder: Path) -> Generator[str]:
 
 def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
     """Take the screenshots of a sheet and write them side by side. Raises: RuntimeError for a page that shows nothing."""
-    import numpy as np
-
     images = []
     for number, (title, page, values) in enumerate(shots):
         frame = {"imports": json.dumps(IMPORTS), "width": WIDTH, "height": HEIGHT, "script": page % values}
@@ -296,8 +290,6 @@ def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
 
 def write_blender_sheet(path: Path, folder: Path, python: Path) -> None:
     """Render the mesh in Blender and write the images side by side. Raises: CalledProcessError."""
-    from humangs_jax.io.images import read_image
-
     script = BLENDER % {"width": WIDTH, "height": HEIGHT}
     subprocess.run([python, "-c", script, folder, ",".join(map(str, BLENDER_FRAMES))], check=True, capture_output=True)
     names = [*(f"glb_{frame}" for frame in BLENDER_FRAMES), "obj"]
@@ -306,13 +298,6 @@ def write_blender_sheet(path: Path, folder: Path, python: Path) -> None:
 
 def save_sheet(path: Path, images: list) -> None:
     """Write images of the same height side by side."""
-    import numpy as np
-    from PIL import Image
-
     pixels = np.rint(255 * np.concatenate(images, axis=1)).astype(np.uint8)
     Image.fromarray(pixels).save(path, quality=85, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
-
-
-if __name__ == "__main__":
-    main()

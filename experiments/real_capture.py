@@ -17,7 +17,6 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy import ndimage
 
-from experiments.evaluation.real_person import FRAMES
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
@@ -38,6 +37,8 @@ from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.io.npz import write_npz
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
+FRAMES = (0, 12, 33, 66, 90)
+"""Of the videos: those that are measured."""
 DEMO = "Pose2Sim/Demo_SinglePerson"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 STRAIGHT, BENT = "straight", "bent"

@@ -1,26 +1,35 @@
-"""What the options of `humangs animate` and `humangs render` give: a sheet of images, and what presets and pruning cost and save.
+"""What the options of `humangs animate` and `humangs render` give: a sheet of images, what presets and pruning cost and save."""
 
-    python experiments/assets/video.py --image docs/images/video.png --json OUT --page docs/video.md
-
-The person is the shipped one, feed-forward (--avatar FILE for another). The walk is the shipped one, moved 2.5 metres forward.
-Times are CPU times of drawing the same frames of the walk, medians of iterations in which each way of drawing has its turn, as
-shares of that of the exact preset; PSNR is the lowest of the frames.
-"""
-
-import argparse
-import sys
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import add_outputs, markdown_table, write_outputs
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.data.motion import Motion
+from experiments.harness import Run, entry
+from experiments.page import shipped_person
+from experiments.results import markdown_table
+from experiments.timing import medians
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import (
+    a_pose_of,
+    draw,
+    images,
+    motion_views,
+    rest_pose_of,
+    splatting_of,
+    turntable_views,
+    without_unseen,
+)
+from humangs_jax.avatar.layers import LAYERS, exr_view
+from humangs_jax.avatar.sheets import tile
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.motion import Motion, load_motion
+from humangs_jax.io.images import to_uint8
 
 WALKED = 2.5
 """Metres."""
@@ -32,55 +41,49 @@ TIMED = 12
 """Frames that are timed, evenly spaced."""
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--avatar", type=Path, help="an avatar file instead of the shipped person")
-    parser.add_argument("--image", type=Path, help="write the sheet here")
-    parser.add_argument("--size", type=int, default=512, help="side of the images that are timed, pixels")
-    parser.add_argument("--repeats", type=int, default=5, help="iterations of timing; 0: none")
-    add_outputs(parser, "video")
-    arguments = parser.parse_args()
-    from experiments.timing import prepare_process
+@entry
+def video(run: Run, avatar: Path | None = None, image: Path | None = None, size: int = 512, repeats: int = 5) -> None:
+    """What the options of `humangs animate` and `humangs render` give, and what presets and pruning cost and save.
 
-    prepare_process()
-    from humangs_jax.avatar.avatar import Avatar
+    The walk is the shipped one, moved 2.5 metres forward. Times are CPU times of drawing the same frames of the walk, medians of
+    iterations in which each way of drawing has its turn, as shares of that of the exact preset; PSNR is the lowest of the frames.
 
-    if arguments.avatar:
-        avatar = Avatar.load(arguments.avatar)
-    else:
-        from experiments.evaluation.page import shipped_person
+    Options:
+    avatar: an avatar file instead of the shipped person, feed-forward
+    image: write a sheet of images here
+    size: side of the images that are timed, pixels
+    repeats: iterations of timing; 0: none
+    """
+    person, motion = Avatar.load(avatar) if avatar else shipped_person(), forward_walk()
+    if image:
+        write_sheet(image, person, motion)
+    if not repeats:
+        return
+    numbers = measure(person, motion, size, repeats)
+    rows = []
+    for name, row in numbers.items():
+        if isinstance(row, dict):
+            shown = name != "exact" and "psnr" in row
+            quality = [f"{row['psnr']:.1f}", f"{255 * row['largest_error']:.1f}"] if shown else ["", ""]
+            rows.append([name, f"{row['cpu_ms'] / numbers['exact']['cpu_ms']:.2f}", *quality])
+    every = numbers["gaussians"]
+    said = (
+        f"{numbers['frames']} frames of {size} pixels. In these frames {numbers['seen'] / every:.1%} of {every:,} Gaussians are "
+        f"seen, in a walk with a whole turn of the camera {numbers['seen_in_a_turn'] / every:.1%}."
+    )
+    table = markdown_table(("", "time", "least PSNR, dB", "largest error, of 255"), rows)
+    run.show(f"{table}\n\n{said}", numbers)
 
-        avatar = shipped_person()
-    motion = forward_walk()
-    if arguments.image:
-        write_sheet(arguments.image, avatar, motion)
-    if arguments.repeats:
-        numbers = measure(avatar, motion, arguments.size, arguments.repeats)
-        write_outputs(arguments, "video", section(numbers), numbers)
 
-
-def forward_walk() -> "Motion":
+def forward_walk() -> Motion:
     """The shipped walk, which is on the spot, moved forward."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.core.pytree import replace
-    from humangs_jax.data.motion import load_motion
-
     motion = load_motion()
     path = np.asarray(motion.translations) + np.linspace([0, 0, 0], [0, 0, WALKED], len(motion.translations))
     return replace(motion, translations=jnp.asarray(path, jnp.float32))
 
 
-def write_sheet(path: Path, avatar: "Avatar", motion: "Motion") -> None:
+def write_sheet(path: Path, avatar: Avatar, motion: Motion) -> None:
     """A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers."""
-    import numpy as np
-    from PIL import Image
-
-    from humangs_jax.avatar.sheets import tile
-    from humangs_jax.io.images import to_uint8
-
     rows: list[list[tuple[str, np.ndarray]]] = [
         walked(avatar, motion, follow=True),
         walked(avatar, motion, follow=False),
@@ -94,13 +97,8 @@ def write_sheet(path: Path, avatar: "Avatar", motion: "Motion") -> None:
     Image.fromarray(to_uint8(np.concatenate(sheet))).save(path, quality=88)
 
 
-def walked(avatar: "Avatar", motion: "Motion", follow: bool) -> "list[tuple[str, np.ndarray]]":
+def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.ndarray]]:
     """Frames of the walk, seen from the side."""
-    import numpy as np
-
-    from humangs_jax.avatar.frames import images, motion_views
-    from humangs_jax.avatar.shot import Shot
-
     shot = Shot(size=240, azimuth=70.0)
     poses, cameras = motion_views(avatar, motion, shot, follow=follow)
     chosen = np.linspace(0, len(poses) - 1, SHOWN).astype(int)
@@ -109,11 +107,8 @@ def walked(avatar: "Avatar", motion: "Motion", follow: bool) -> "list[tuple[str,
     return [(f"{name}: {i / motion.fps:.1f} s", image) for i, image in zip(chosen, drawn, strict=True)]
 
 
-def looked_at(avatar: "Avatar", motion: "Motion") -> "list[tuple[str, np.ndarray]]":
+def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     """One frame by other cameras."""
-    from humangs_jax.avatar.frames import images, motion_views
-    from humangs_jax.avatar.shot import Shot
-
     shots = {
         "--azimuth 180": Shot(size=240, azimuth=180.0),
         "--elevation 60": Shot(size=240, azimuth=20.0, elevation=60.0),
@@ -130,11 +125,8 @@ def looked_at(avatar: "Avatar", motion: "Motion") -> "list[tuple[str, np.ndarray
     return drawn
 
 
-def posed_before(avatar: "Avatar") -> "list[tuple[str, np.ndarray]]":
+def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
     """T-pose and A-pose before several backgrounds."""
-    from humangs_jax.avatar.frames import a_pose_of, images, rest_pose_of, turntable_views
-    from humangs_jax.avatar.shot import Shot
-
     drawn = []
     for name, pose in (("T-pose", rest_pose_of(avatar)), ("--pose a", a_pose_of(avatar))):
         for color in ("white", "#24425c", "transparent"):
@@ -146,8 +138,6 @@ def posed_before(avatar: "Avatar") -> "list[tuple[str, np.ndarray]]":
 
 def over_checks(image: "np.ndarray") -> "np.ndarray":
     """A transparent image over grey squares; another one as it is."""
-    import numpy as np
-
     if image.shape[-1] == 3:
         return image
     rows, columns = (np.arange(size) // 12 for size in image.shape[:2])
@@ -155,15 +145,8 @@ def over_checks(image: "np.ndarray") -> "np.ndarray":
     return image[..., :3] * image[..., 3:] + checks * (1 - image[..., 3:])
 
 
-def layered(avatar: "Avatar", motion: "Motion") -> "list[tuple[str, np.ndarray]]":
+def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     """The layers of an EXR file, as colors."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.avatar.frames import draw, motion_views, splatting_of
-    from humangs_jax.avatar.layers import LAYERS, exr_view
-    from humangs_jax.avatar.shot import Shot
-
     shot = Shot(size=240, azimuth=20.0)
     poses, cameras = motion_views(avatar, motion, shot)
     pose, camera, how = poses[FIRST], cameras[FIRST], splatting_of(shot, avatar)
@@ -189,16 +172,8 @@ def layered(avatar: "Avatar", motion: "Motion") -> "list[tuple[str, np.ndarray]]
     ]
 
 
-def measure(avatar: "Avatar", motion: "Motion", size: int, repeats: int) -> dict[str, Any]:
+def measure(avatar: Avatar, motion: Motion, size: int, repeats: int) -> dict[str, Any]:
     """PSNR and CPU time of presets, of the search for what is seen, and of drawing without the rest."""
-    import dataclasses
-
-    import numpy as np
-
-    from experiments.timing import medians
-    from humangs_jax.avatar.frames import draw, motion_views, splatting_of, without_unseen
-    from humangs_jax.avatar.shot import Shot
-
     shot = Shot(size=size, azimuth=20.0)
     poses, cameras = motion_views(avatar, motion, shot)
     chosen = np.linspace(0, len(poses) - 1, TIMED).astype(int)
@@ -208,7 +183,7 @@ def measure(avatar: "Avatar", motion: "Motion", size: int, repeats: int) -> dict
     turned_poses, turned_cameras = motion_views(avatar, motion, shot, turn=360.0)
     turned = without_unseen(avatar, turned_poses[chosen], turned_cameras[chosen], exact)
 
-    def drawing(person: "Avatar", how: Any) -> "Callable[[], list[np.ndarray]]":
+    def drawing(person: Avatar, how: Any) -> Callable[[], list[np.ndarray]]:
         return lambda: [np.asarray(rendering.rgb) for rendering in draw(person, poses, cameras, None, how)]
 
     runs: dict[str, Callable[[], Any]] = {
@@ -236,26 +211,3 @@ def measure(avatar: "Avatar", motion: "Motion", size: int, repeats: int) -> dict
 
 
 PRESETS = ("exact", "near_exact", "fast")
-
-
-def section(numbers: dict[str, Any]) -> str:
-    """The table."""
-    unit = numbers["exact"]["cpu_ms"]
-    rows = []
-    for name, row in numbers.items():
-        if not isinstance(row, dict):
-            continue
-        quality = ["", ""]
-        if name != "exact" and "psnr" in row:
-            quality = [f"{row['psnr']:.1f}", f"{255 * row['largest_error']:.1f}"]
-        rows.append([name, f"{row['cpu_ms'] / unit:.2f}", *quality])
-    table = markdown_table(("", "time", "least PSNR, dB", "largest error, of 255"), rows)
-    every = numbers["gaussians"]
-    return (
-        f"{table}\n\n{numbers['frames']} frames of {numbers['size']} pixels. In these frames {numbers['seen'] / every:.1%} of "
-        f"{every:,} Gaussians are seen, in a walk with a whole turn of the camera {numbers['seen_in_a_turn'] / every:.1%}."
-    )
-
-
-if __name__ == "__main__":
-    main()

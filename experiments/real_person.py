@@ -1,4 +1,4 @@
-"""The rows of `real_person.py`: what the package makes of the man, and how it is scored."""
+"""A real man from four photos of a moment: how well the body fills his masks, how like him the avatar is where no photo was."""
 
 import dataclasses
 import functools
@@ -6,14 +6,15 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from experiments.common.results import markdown_table, write_json
-from experiments.evaluation.real_cameras import camera_errors, reference_cameras, seen_from, to_reference
-from experiments.evaluation.real_capture import (
+from experiments.harness import Run, entry
+from experiments.real_cameras import camera_errors, reference_cameras, seen_from, to_reference
+from experiments.real_capture import (
+    FRAMES,
     PACKAGE,
     SIZE,
     VERSION,
@@ -24,19 +25,22 @@ from experiments.evaluation.real_capture import (
     held_out,
     prepare,
 )
-from experiments.evaluation.real_people import (
+from experiments.real_people import (
     as_fitted,
+    draw_sheet,
     one_view_each,
     person_in_rooms,
     started,
     video_sizes,
     without_calibration,
 )
+from experiments.results import markdown_table, write_json
 from experiments.subjects import shipped_digest
 from humangs_jax.apps.held_out import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
+from humangs_jax.core.compiling import enable_compile_cache
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
@@ -280,3 +284,46 @@ def _table(results, kinds, columns):
                 rows.append([row, label, len(cases), *shown])
     header = ["row", "state", "cases", *(heading for heading, _ in columns.values())]
     return markdown_table(header, rows, "ll" + "r" * (len(header) - 2)) if rows else ""
+
+
+@entry
+def real_person(
+    run: Run,
+    data: Path,
+    out: Path,
+    label: str = "now",
+    rows: tuple[Literal["calibrated", "poses", "uncalibrated", "moments", "rooms", "start"], ...] = (),
+    frames: tuple[int, ...] = FRAMES,
+    ways: tuple[Literal["refine", "fit"], ...] = ("refine", "fit"),
+    masks: tuple[Literal["detected", "careful"], ...] = ("detected", "careful"),
+    pictures: Path | None = None,
+) -> None:
+    """A real man from four photos of a moment: how well the body fills his masks, how like him the avatar is where no photo was.
+
+    Needs the extra `photos` and `imageio-ffmpeg`. Everything is scored by careful masks, in squares of 512 pixels. Rows:
+    calibrated, the published calibration: held out, cameras and body know all four photos, the avatar three; unseen, nothing
+    knows the fourth photo; where its camera stands is told by cameras that all frames have refined together. poses: the avatar
+    of one frame in the poses of the others. uncalibrated: cameras from the person. moments: the same, of photos that each show
+    another moment.
+    rooms: synthetic people in photographed rooms. start: `humangs start` on four photos of 12 megapixels, seconds.
+
+    Options:
+    data: where `pose2sim` is downloaded to and what is made of it stays
+    out: numbers are written here; a run of the same --label goes on where an earlier one stopped
+    label: of this state of the package
+    rows: default: all
+    frames: of the videos, 0 to 99
+    ways: of finding the body
+    masks: that photos are cut out by
+    pictures: JPEG of the avatar from all sides, and walking
+    """
+    if not all(0 <= frame < 100 for frame in frames):
+        raise ValueError("--frames: expected 0 to 99")
+    enable_compile_cache()
+    results, man = Results(out, label), Man(data, frames, ways, masks)
+    for row in rows or ROWS:
+        ROWS[row](results, man)
+    if pictures:
+        body = man.body(man.numbers[0], "detected")
+        draw_sheet(avatar_of(body), body, pictures)
+    run.show(section(results.all), results.all)

@@ -1,0 +1,184 @@
+"""The page that shows avatars against `hg.render`, in Chromium with software WebGL."""
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.chromium import Chromium, missing
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.motion import load_motion
+from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.losses import metrics
+from humangs_jax.network.weights import load_weights
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+from humangs_jax.rendering.splatting import render
+from humangs_jax.viewer.page import write_page
+
+AZIMUTHS = (0.0, 1.1, 2.9)
+ELEVATIONS = (0.1, 0.5, -0.2)
+WALK_FRAME = 17
+VERTICAL_FOV = math.pi / 6
+FINE_EDGE = 0.017
+"""Metres; the longest edge of a body that carries some 60,000 Gaussians."""
+MOTION_WINDOW = (480, 600)
+KEPT_WEIGHTS = (2, 4, 6, 8)
+SHOWN = (
+    ("least PSNR of nine views, dB", "whole"),
+    ("on the person, dB", "person"),
+    ("after 100 frames of motion, dB", "motion_whole"),
+    ("on the person, dB", "motion_person"),
+)
+
+
+@entry
+def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20) -> None:
+    """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with software WebGL.
+
+    Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses, screenshots against `hg.render` of
+    the same camera and pose. "Motion": the page plays 100 frames on its own and is paused; its image is compared with
+    `hg.render` from the camera and in the pose that it reports. Frames per second: a turning camera, posed, sorted and drawn
+    without waiting for the screen, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges).
+
+    Options:
+    avatar: an avatar file instead of the shipped person, feed-forward
+    size: side of the images in pixels
+    frames: images that are timed
+    """
+    if reason := missing():
+        raise ValueError(reason)
+    avatars = {"avatar": Avatar.load(avatar) if avatar else shipped_person(), "finer": shipped_person(FINE_EDGE)}
+    kept = truncation_scores(avatars["avatar"], size)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [_measured(each, Path(folder) / f"{name}.html", size, frames) for name, each in avatars.items()]
+    header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
+    lines = [[label, *(f"{row[key]:.1f}" for row in rows)] for label, key in SHOWN]
+    lines.append(["size of the page, MB", *(f"{row['bytes'] / 1e6:.2f}" for row in rows)])
+    lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
+    lines.append([f"frames per second, {size} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
+    lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
+    kept_row = [["foreground PSNR, dB", *(f"{value:.0f}" for value in kept.values())]]
+    text = markdown_table(header, lines) + "\n\n" + markdown_table(["skinning weights kept", *kept], kept_row)
+    run.show(text, {"size": size, "weights_kept": kept} | dict(zip(avatars, rows, strict=True)))
+
+
+def _measured(avatar, file, size, frames):
+    row: dict[str, Any] = {"gaussians": len(avatar.gaussians.means), "bytes": write_page(file, avatar)}
+    with Chromium() as browser:
+        browser.open(file)
+        row["first_image_seconds"] = browser.run("return humangs.firstImage") / 1000
+        views = view_scores(browser, avatar, size)
+        row["whole"], row["person"] = (min(pair[i] for pair in views.values()) for i in (0, 1))
+        row["views"] = views
+        row["motion_whole"], row["motion_person"] = motion_scores(browser, avatar, 100)
+        asked = {"frames": frames, "width": size, "height": size}
+        timed = browser.run("return humangs.benchmark(given[0])", asked)
+        return row | {"fps": timed["fps"], "sort_ms": timed["sort_ms"], "console": browser.problems()}
+
+
+def shipped_person(longest_edge: float | None = None) -> Avatar:
+    """The person of the demo from four photos, feed-forward."""
+    variables, config = load_weights()
+    config = config.with_runtime(longest_edge=longest_edge)
+    return reconstruct(variables, config, load_capture(DEMO_CAPTURE))
+
+
+def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyPose]]:
+    """Three cameras and three poses; all look at the person in the pose."""
+    joints = len(avatar.parents)
+    poses = {
+        "T-pose": BodyPose(jnp.zeros((joints, 3)), jnp.zeros(3)),
+        "walk": load_motion().pose(WALK_FRAME),
+        "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0),
+    }
+    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
+    cameras = orbit(
+        jnp.asarray(avatar.rest_vertices.mean(0)),
+        1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV),
+        jnp.asarray(AZIMUTHS),
+        jnp.asarray(ELEVATIONS),
+        intrinsics_from_fov(VERTICAL_FOV, size, size),
+        size,
+        size,
+    )
+    # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back there
+    poses = {name: BodyPose(pose.rotations, jnp.zeros(3)) for name, pose in poses.items()}
+    return [cameras[i] for i in range(len(AZIMUTHS))], poses
+
+
+def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple[float, float]]:
+    """PSNR of the whole image and of the person, dB, by pose and camera."""
+    cameras, poses = test_views(avatar, size)
+    scores = {}
+    browser.resize(size, size)
+    for name, pose in poses.items():
+        for index, camera in enumerate(cameras):
+            image = exact_image(browser, camera, pose)
+            scores[f"{name}, camera {index + 1}"] = compare(image, avatar, camera, pose)
+    browser.run("humangs.resume()")
+    browser.resize(1280, 800)
+    return scores
+
+
+def exact_image(browser: Chromium, camera: Camera, pose: BodyPose) -> Any:
+    """The screenshot of one camera and pose on white, (h, w, 3)."""
+    view = {name: np.asarray(getattr(camera, name), float).tolist() for name in ("K", "cam_from_world")}
+    view |= {"width": camera.width, "height": camera.height}
+    view |= {"rotations": np.asarray(pose.rotations, float).tolist()}
+    view |= {"translation": np.asarray(pose.translation, float).tolist()}
+    browser.run("humangs.draw(given[0])", view)
+    return browser.screenshot()[: camera.height, : camera.width]
+
+
+def compare(image: Any, avatar: Avatar, camera: Camera, pose: BodyPose) -> tuple[float, float]:
+    """PSNR to `hg.render` of the whole image and of the person, dB."""
+    rendering = render(skin(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering])
+    truth, image = jnp.clip(rendering.rgb, 0, 1), jnp.asarray(image)
+    return float(metrics.psnr(image, truth)), float(metrics.masked_psnr(image, truth, rendering.alpha))
+
+
+def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float, float]:
+    """The page plays by itself, sorted by its worker; then its image as `hg.render` draws it, person and floor apart."""
+    browser.resize(*MOTION_WINDOW)
+    browser.run(
+        """document.getElementById("ground").checked && document.getElementById("ground").click();
+        document.querySelector("#swatches button[title='#ffffff']").click();
+        document.body.classList.add("hidden");"""
+    )
+    for _ in range(frames // 10):
+        browser.run("await humangs.play(10)")
+    browser.run("await humangs.settle()")
+    view = browser.run("return humangs.view()")
+    image = browser.screenshot()
+    browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")
+    browser.resize(1280, 800)
+    pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
+    camera = Camera.from_opencv(
+        np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]
+    )
+    return compare(image, avatar, camera, pose)
+
+
+def truncation_scores(avatar: Avatar, size: int) -> dict[str, float]:
+    """foreground PSNR, dB, of `hg.render` in a pose of the walk, by the number of skinning weights kept of each Gaussian."""
+    cameras, poses = test_views(avatar, size)
+    scores = {}
+    for kept in KEPT_WEIGHTS:
+        weights = avatar.skinning_weights
+        least = jnp.sort(weights, axis=1)[:, -kept][:, None]
+        weights = jnp.where(weights >= least, weights, 0.0)
+        fewer = replace(avatar, skinning_weights=weights / weights.sum(1, keepdims=True))
+        image = jnp.clip(render(skin(fewer, poses["walk"]), cameras[0]).rgb, 0, 1)
+        scores[str(kept)] = compare(image, avatar, cameras[0], poses["walk"])[1]
+    return scores
