@@ -8,6 +8,7 @@ FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps h
 `!!opencv-matrix` with rows, cols, dt and data. https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
 """
 
+import functools
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -40,20 +41,26 @@ def recognizes(source: Source) -> bool:
     """Whether a file has K, R and T of cameras."""
     if not (source.text.lstrip().startswith(("{", "%YAML", "---")) or source.path.suffix in (".yml", ".yaml")):
         return False
-    values = parse_file_storage(source.text, source.path)
+    values = _values(source)
     maps = (value for value in values.values() if isinstance(value, Mapping))
     return bool(_names(values)) or any({"K", "R", "T"} & set(each) for each in maps)
 
 
 def read(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of one file. Raises: CaptureError naming the key."""
-    values, file = parse_file_storage(source.text, source.path), source.path
+    values, file = _values(source), source.path
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
     if not nested:
         return source.calibration(format, flat_cameras(values, values, (file, file), values.get("names")))
     before = lambda name: lambda key: f"{name}.{key}"
     cameras = [_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
     return source.calibration(format, cameras)
+
+
+@functools.lru_cache(maxsize=1)
+def _values(source: Source) -> dict[str, Any]:
+    """Parsed once: YAML is slow."""
+    return parse_file_storage(source.text, source.path)
 
 
 def flat_cameras(
