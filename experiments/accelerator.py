@@ -34,7 +34,7 @@ from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-from humangs_jax.people.seeds import SPLITS
+from humangs_jax.people.subject import SPLITS
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import plan_buffers, render

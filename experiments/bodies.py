@@ -18,10 +18,10 @@ from experiments.results import markdown_table
 from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.sheets import contact_sheet
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
+from humangs_jax.body.resolution import decimate
 from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body

@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY
 from humangs_jax.body.library import load_body
-from humangs_jax.people.seeds import split_of
+from humangs_jax.people.subject import split_of
 from humangs_jax.people.writer import Layout, write_person
 
 ASSETS = REPOSITORY / "humangs_jax" / "assets"

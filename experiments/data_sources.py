@@ -120,7 +120,7 @@ def examples(people: Any, inputs: int, targets: int, count: int) -> Any:
 
 def measure_reading(people: Any, samples: int) -> dict[str, float]:
     """Seconds to open people and to read samples."""
-    opened = spent(lambda: [person.boundary() for person in people])
+    opened = spent(lambda: [person.summary() for person in people])
     list(examples(people, INPUTS, TARGETS, 2))
     took = spent(lambda: list(examples(people, INPUTS, TARGETS, samples)))
     speeds = {"samples_per_s": samples / took["wall_s"], "cpu_s_per_sample": took["cpu_s"] / samples}

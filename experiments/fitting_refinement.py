@@ -26,8 +26,7 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import project
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.seeds import seeds_of
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import make_subject, seeds_of
 from humangs_jax.people.writer import View, capture_views, stand
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 

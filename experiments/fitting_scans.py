@@ -22,8 +22,7 @@ from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.seeds import seeds_of
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import make_subject, seeds_of
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 POSE_STREAM, JOINT_STREAM, PLACE_STREAM = 31, 33, 34

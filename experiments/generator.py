@@ -12,7 +12,7 @@ from experiments.harness import Run, entry, figure
 from experiments.results import markdown_table
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.people import cameras, kinematics, rendering
+from humangs_jax.people import anatomy, cameras, rendering
 from humangs_jax.people.rendering import padded
 from humangs_jax.people.subject import describe, make_subject
 from humangs_jax.people.writer import sample_pose
@@ -271,8 +271,8 @@ def draw(file, people, seen):
         shares = seen["colours"].sum((1, 2)) / seen["colours"].sum()
         hue.bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
         hue.set_xlabel("hue of the person's pixels")
-        joints = {"hip": kinematics.LEFT_HIP, "knee": kinematics.LEFT_KNEE, "shoulder": kinematics.LEFT_SHOULDER}
-        joints |= {"elbow": kinematics.LEFT_ELBOW, "spine": kinematics.SPINE2, "neck": kinematics.NECK}
+        joints = {"hip": anatomy.LEFT_HIP, "knee": anatomy.LEFT_KNEE, "shoulder": anatomy.LEFT_SHOULDER}
+        joints |= {"elbow": anatomy.LEFT_ELBOW, "spine": anatomy.SPINE2, "neck": anatomy.NECK}
         angles = [np.rad2deg(seen["angles"][:, j]) for j in joints.values()]
         bent.boxplot(angles, tick_labels=list(joints), showfliers=False)
         bent.set_ylabel("joint angle, degrees")

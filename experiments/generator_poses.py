@@ -10,19 +10,18 @@ import numpy as np
 from PIL import Image
 
 from experiments.harness import Run, entry
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.geometry.camera import intrinsics_from_fov, look_at, orbit
 from humangs_jax.io.images import write_png
-from humangs_jax.people import kinematics as poses
-from humangs_jax.people.kinematics import LIMITS, Build, Rotations
+from humangs_jax.people import anatomy as poses
+from humangs_jax.people.anatomy import LIMITS, Build, Rotations
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import pose_subject, render_view
-from humangs_jax.people.seeds import DEMO
 from humangs_jax.people.sequences import KINDS, sample_sequence
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import DEMO, make_subject
 from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh

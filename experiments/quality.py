@@ -41,8 +41,7 @@ from humangs_jax.evaluation.scores import score
 from humangs_jax.losses import metrics
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
-from humangs_jax.people.seeds import seeds_of
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import make_subject, seeds_of
 from humangs_jax.people.writer import View, capture_views, sample_pose
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER

@@ -51,7 +51,7 @@ from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import apply_humangs, init_humangs
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.seeds import seeds_of
+from humangs_jax.people.subject import seeds_of
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.diagnose import Recorder, observe_subject
 from humangs_jax.training.forward import draw_targets, white_backgrounds

@@ -37,8 +37,7 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.rendering import PosedSubject
-from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of
-from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, seeds_of
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12

@@ -49,7 +49,7 @@ from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.io.images import resized
 from humangs_jax.network.presets import published
 from humangs_jax.network.weights import SHIPPED, load_weights
-from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of
+from humangs_jax.people.subject import GENERATOR_VERSION, seeds_of
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine_with_report
 

@@ -40,7 +40,7 @@ from humangs_jax.losses.ssim import structural_dissimilarity
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-from humangs_jax.people.seeds import seeds_of
+from humangs_jax.people.subject import seeds_of
 from humangs_jax.refinement.learned import (
     Refiner,
     Signals,

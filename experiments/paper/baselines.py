@@ -65,9 +65,9 @@ def on_validation(folder: Path, count: int) -> dict[str, float]:
     cache = CaptureCache(folders, load_capture(folders[0]).body)
     sampling = ViewSampling((count,), target_count=TARGETS, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
     for index, subject in enumerate(subject_order(0, 0, len(folders))):
-        boundary = cache.boundary(int(subject))
-        assert boundary is not None
-        inputs, targets = draw_views(view_generator(0, index), boundary, count, sampling)
+        summary = cache.summary(int(subject))
+        assert summary is not None
+        inputs, targets = draw_views(view_generator(0, index), summary, count, sampling)
         capture = load_capture(folders[int(subject)])
         rows.append(scores(capture.select(inputs), capture.select(targets)))
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}

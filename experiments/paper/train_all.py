@@ -37,7 +37,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.loading import CaptureCache, find_captures
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
-from humangs_jax.people.seeds import seeds_of
+from humangs_jax.people.subject import seeds_of
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.sources import on_the_fly_people, people_on_disk
 

@@ -19,9 +19,11 @@ have SMPL-X's names has them. Sides are the person's. By name:
     jaw                                                the joint
 
 Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. Where
-it is known at which places a detector sees its landmarks, they are moved there: `body.places`. The
-other 65 points of the face are not on this list: they follow expressions, which bodies without a face rig do not have.
+it is known at which places a detector sees its landmarks, they are moved there: `Place`. The other 65 points of the face are not
+on this list: they follow expressions, which bodies without a face rig do not have.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +32,55 @@ import numpy as np
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
-from humangs_jax.body.places import Place
-from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
+from humangs_jax.body.skinning import SurfacePoints, pose_points, shaped
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
+
+# Places of detectors --------------------------------------------------------------------------------------------------
+
+
+Millimetres = tuple[float | int, float | int, float | int]
+
+
+class Place(NamedTuple):
+    """Where a detector sees one of its landmarks.
+
+    name: of the landmark. base: the landmark of `body.landmarks` that it is measured from. offset: from there, metres in T-pose:
+    x to the person's left, y up, z to the front. joints: whose turning carries the offset along, by equal shares; none: what
+    carries the base, which then is a vertex.
+    """
+
+    name: str
+    base: str
+    offset: tuple[float, float, float]
+    joints: tuple[str, ...] = ()
+
+
+def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres) -> Place:
+    """A landmark whose offset is in millimetres."""
+    x, y, z = millimetres
+    return Place(name, base, (x / 1000, y / 1000, z / 1000), joints)
+
+
+def both_sides(
+    names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
+) -> tuple[Place, Place]:
+    """A landmark of the left side and its mirror image.
+
+    Arguments: names: of the left and the right one. base, joints: with {side} for the side. millimetres: the left one's.
+    """
+    x, y, z = millimetres
+    left, right = (
+        place(name, base.format(side=side), tuple(joint.format(side=side) for joint in joints), (sign * x, y, z))
+        for name, side, sign in zip(names, ("left", "right"), (1, -1), strict=True)
+    )
+    return left, right
+
+
+# Landmarks ------------------------------------------------------------------------------------------------------------
+
 
 SIDES = {"left": 1.0, "right": -1.0}
 """And the sign of x that is outwards in T-pose."""

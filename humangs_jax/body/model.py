@@ -49,7 +49,7 @@ class BodyModel:
     skinning_weights: (n, j) non-negative, rows sum to 1.
     faces: (f, 3) vertex indices, counter-clockwise seen from outside.
     uvs, uv_faces: (u, 2) texture coordinates (v up) and (f, 3) indices into them, or None.
-    collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.decimation`.
+    collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.resolution`.
     spacing: (n,) or None: distance to neighbouring vertices relative to the mesh that was subdivided, see `body.subdivision`.
     texels: a map of the surface for networks that work on one, see `network.parts`; or None.
     parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static. made_for: static, what

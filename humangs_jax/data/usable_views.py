@@ -15,6 +15,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.geometry.mesh import face_areas
 
 logger = logging.getLogger(__name__)
 
@@ -133,8 +134,7 @@ def _sampling(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
     """Corners (p, 3) and weights (p, 3) of points that are spread evenly over a mesh."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    areas = face_areas(vertices, faces)
     rng = np.random.default_rng(0)
     chosen = np.searchsorted(np.cumsum(areas), (np.arange(count) + 0.5) / count * areas.sum())
     u, v = rng.random((2, count))

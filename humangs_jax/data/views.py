@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
-from humangs_jax.body.subdivision import split_long_edges, vertex_areas
+from humangs_jax.body.resolution import decimate, split_long_edges, vertex_areas
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace

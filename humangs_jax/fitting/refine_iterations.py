@@ -16,8 +16,7 @@ import numpy as np
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body, without_expression
-from humangs_jax.body.skinning import EXACT
-from humangs_jax.body.surface_points import SurfacePoints, pose_points
+from humangs_jax.body.skinning import EXACT, SurfacePoints, pose_points
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture

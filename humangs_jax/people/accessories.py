@@ -8,12 +8,21 @@ import functools
 import numpy as np
 
 from humangs_jax.people import hair, surfaces, tailoring
-from humangs_jax.people.anatomy import FLOOR, Anatomy
+from humangs_jax.people.anatomy import FLOOR, HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE, Anatomy
 from humangs_jax.people.fabrics import Material, band, color, mix
-from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE
-from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.surfaces import Boundaries, Surface, blurred, circle, grid_faces, hanging, join, sweep, unit
+from humangs_jax.people.surfaces import (
+    Boundaries,
+    Surface,
+    blurred,
+    circle,
+    grid_faces,
+    hanging,
+    join,
+    ripples,
+    sweep,
+    unit,
+)
 
 RING, COLUMNS = 40, 32
 """Points of a ring around neck or head; of a ring of a shoe."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
-from humangs_jax.people.kinematics import Vector
+from humangs_jax.people.anatomy import Vector
 from humangs_jax.people.surfaces import Points
 
 VERTICAL_FOV, ELEVATION = np.deg2rad(60.0), np.deg2rad(np.asarray([-5.0, 15.0]))

@@ -6,8 +6,8 @@ import numpy as np
 
 from humangs_jax.people.fabrics import Material, Spots, band, color, mix
 from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, beard_field
-from humangs_jax.people.noise import Ripples, lattice
 from humangs_jax.people.outfits import drawn
+from humangs_jax.people.surfaces import Ripples, lattice
 
 EYE_X, EYE_Y, MOUTH_Y, HAND_Y = 0.029, 0.330, 0.2629, 0.085
 """Places in template coordinates; the last parts the backs of the hands from the palms."""

@@ -13,10 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
-from humangs_jax.people.kinematics import Vector
-from humangs_jax.people.noise import Ripples, choice, hashed, lattice
-from humangs_jax.people.surfaces import Field, Points
+from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, Vector, sewn_coordinates
+from humangs_jax.people.surfaces import Field, Points, Ripples, choice, hashed, lattice
 
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""

@@ -9,11 +9,9 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.people import surfaces
-from humangs_jax.people.anatomy import Anatomy, smoothstep
-from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
-from humangs_jax.people.noise import ripples
+from humangs_jax.people.anatomy import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3, Anatomy, smoothstep
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
-from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, boundaries, cut, rigid, smooth
+from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, boundaries, cut, rigid, ripples, smooth
 from humangs_jax.people.tailoring import finished, nearest_weights
 
 CUTS = {

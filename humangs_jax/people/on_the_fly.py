@@ -26,17 +26,15 @@ from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.loading.examples import Example
-from humangs_jax.data.loading.order import SUBJECT_STREAM
+from humangs_jax.data.loading.examples import SUBJECT_STREAM, Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import cameras, shading
-from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO
-from humangs_jax.people.bank import UV_STEPS, PeopleBank
+from humangs_jax.people.anatomy import MIRROR
+from humangs_jax.people.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
 from humangs_jax.people.cameras import pick
-from humangs_jax.people.kinematics import MIRROR
-from humangs_jax.people.seeds import SPLITS, subject_key
+from humangs_jax.people.subject import SPLITS, subject_key
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 

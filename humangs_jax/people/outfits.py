@@ -13,7 +13,7 @@ import numpy as np
 
 from humangs_jax.people.anatomy import WRIST
 from humangs_jax.people.fabrics import Fabric, sample_fabric
-from humangs_jax.people.noise import choice
+from humangs_jax.people.surfaces import choice
 
 TOPS = ("tank", "tee", "longsleeve", "polo", "shirt", "blouse", "sweater", "turtleneck", "hoodie", "jersey")
 OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")

@@ -2,7 +2,7 @@
 
 Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the one whose wrist comes nearest
 to a goal, among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
-gestures. `kinematics` has the joints, their limits and the conventions.
+gestures. `anatomy` has the joints, their limits and the conventions.
 """
 
 import dataclasses
@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.people import kinematics as kin
-from humangs_jax.people.noise import choice
+from humangs_jax.people import anatomy as kin
+from humangs_jax.people.surfaces import choice
 
 TRIES = 20
 """Stances tried until one is within the limits of the joints; after that the person stands upright."""

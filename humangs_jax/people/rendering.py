@@ -9,11 +9,10 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import shading
+from humangs_jax.people.anatomy import Rotations, Vector
 from humangs_jax.people.fabrics import Spots
-from humangs_jax.people.kinematics import Rotations, Vector
-from humangs_jax.people.noise import Folds
 from humangs_jax.people.subject import SyntheticSubject
-from humangs_jax.people.surfaces import Faces, Field, Points, vertex_normals
+from humangs_jax.people.surfaces import Faces, Field, Folds, Points, vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SUPERSAMPLING = 2

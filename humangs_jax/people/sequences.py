@@ -1,7 +1,7 @@
 """Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the ground stay where they are.
 
 Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the next, the pelvis goes along
-and as high as the legs let it, legs are solved for (`kinematics.place_feet`). Reaches keep both feet planted and move from
+and as high as the legs let it, legs are solved for (`anatomy.place_feet`). Reaches keep both feet planted and move from
 pose to pose. World as everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
 """
 
@@ -12,9 +12,9 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.people import kinematics as kin
-from humangs_jax.people.noise import choice
+from humangs_jax.people import anatomy as kin
 from humangs_jax.people.poses import ARMS, STANCES, arm_clearance, bend_arm, bend_trunk, draw_goal, in_world, pose_hand
+from humangs_jax.people.surfaces import choice
 
 FPS, LONG_STEP = 30.0, 0.75
 """Frames a second; a long step in lengths of a leg."""

@@ -14,7 +14,7 @@ from jax.scipy.special import ndtri
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
-from humangs_jax.people.noise import choice
+from humangs_jax.people.surfaces import choice
 
 CELL, GRID, MARGIN = 0.025, (112, 104, 80), 6
 """Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes (what lies outside casts no

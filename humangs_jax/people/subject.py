@@ -1,6 +1,10 @@
 """A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build (`make_subject`).
 
 A description is a few numbers and takes milliseconds; thousands can be counted without building any geometry.
+
+Seeds and keys are for training, validation, test and documentation; the ranges share no person. A seed names a person. Written
+people are made from the seed by numpy; people made on the fly from its keys, whose words are (appearance, seed), so that the
+person, and the split, can be read off every key.
 """
 
 import dataclasses
@@ -10,16 +14,82 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Float, Int, Key
 from humangs_jax.people import complexion, hair, wardrobe
-from humangs_jax.people.anatomy import BODY_NAME, BODY_VERTICES, measure
+from humangs_jax.people.anatomy import (
+    BODY_NAME,
+    BODY_VERTICES,
+    LEFT_KNEE,
+    Build,
+    Rotations,
+    Vector,
+    joint_positions,
+    measure,
+)
 from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material
 from humangs_jax.people.hair import Haircut, sample_haircut
-from humangs_jax.people.kinematics import LEFT_KNEE, Build, Rotations, Vector, joint_positions
 from humangs_jax.people.outfits import Garment, sample_outfit
 from humangs_jax.people.shading import Lights, sample_lights
 from humangs_jax.people.surfaces import Field, Points, Surface, compact, join
+
+# Seeds ----------------------------------------------------------------------------------------------------------------
+
+
+GENERATOR_VERSION = 2
+"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of different versions are not
+mixed in one folder."""
+
+TRAIN = range(0, 1_000_000)
+VALIDATION = range(1_000_000, 1_001_000)
+TEST = range(2_000_000, 2_001_000)
+"""Held out of training and of every choice made on the validation people."""
+DEMO = range(3_000_000, 3_001_000)
+"""People of the documentation and the tests."""
+FITTING = range(4_000_000, 4_001_000)
+"""People that fitting and refinement are tuned and measured on: no other result sees them."""
+TRADEOFF = range(5_000_000, 5_001_000)
+"""People that the presets of speed and accuracy are chosen on."""
+
+SPLITS = {
+    "train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO, "fitting": FITTING, "tradeoff": TRADEOFF,
+}  # fmt: skip
+
+KEY_KIND = "threefry2x32"
+"""Implementation of all keys of people: the words of such a key are its seed."""
+APPEARANCES = 2**32
+
+
+def split_of(seed: int) -> str:
+    """Name of the range that a seed lies in. Raises ValueError if it lies in none."""
+    for name, seeds in SPLITS.items():
+        if seed in seeds:
+            return name
+    ranges = ", ".join(f"{name} {seeds.start}..{seeds.stop - 1}" for name, seeds in SPLITS.items())
+    raise ValueError(f"seed {seed} lies in no range: {ranges}")
+
+
+def seeds_of(split: str, first: int, count: int) -> range:
+    """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
+    people = SPLITS[split]
+    if first < 0 or count < 1 or first + count > len(people):
+        asked = f"subjects {first}..{first + count - 1}"
+        raise ValueError(f"{asked} reach beyond the split '{split}', which has {len(people)}")
+    return people[first : first + count]
+
+
+def subject_key(seed: int, appearance: int = 0) -> Key:
+    """The key of a person; further appearances (other clothes, pose, light) have further keys.
+
+    Raises: ValueError if the seed lies in no range of `SPLITS`.
+    """
+    split_of(seed)
+    words = np.asarray([appearance % APPEARANCES, seed], np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
+
+
+# People ---------------------------------------------------------------------------------------------------------------
+
 
 SHAPE_STD = 0.55
 """Standard deviation of the shape coefficients without a rule of their own; values are clipped at twice that."""

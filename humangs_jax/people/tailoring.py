@@ -10,10 +10,18 @@ import dataclasses
 import numpy as np
 
 from humangs_jax.people import surfaces
-from humangs_jax.people.anatomy import ANKLE, ARM_HEIGHT, FLOOR, Anatomy, sewn_coordinates, smoothstep
-from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER
-from humangs_jax.people.noise import ripples
-from humangs_jax.people.surfaces import Field, Points, Surface, blurred, hanging, polar, smooth
+from humangs_jax.people.anatomy import (
+    ANKLE,
+    ARM_HEIGHT,
+    FLOOR,
+    LEFT_HIP,
+    LEFT_KNEE,
+    LEFT_SHOULDER,
+    Anatomy,
+    sewn_coordinates,
+    smoothstep,
+)
+from humangs_jax.people.surfaces import Field, Points, Surface, blurred, hanging, polar, ripples, smooth
 
 TRUNK_HALF_WIDTH = 0.25
 """In T-pose everything further out than this is an arm."""

@@ -11,9 +11,8 @@ import numpy as np
 from humangs_jax.core.array_types import Bool
 from humangs_jax.people.anatomy import ARMHOLE, WAIST
 from humangs_jax.people.fabrics import Spots, accent, band, color, mix
-from humangs_jax.people.noise import lattice
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, TOPS, Garment
-from humangs_jax.people.surfaces import Field, Points
+from humangs_jax.people.surfaces import Field, Points, lattice
 
 QUILT = 0.075
 """Period of quilted cloth, metres."""

@@ -36,13 +36,12 @@ from humangs_jax.data.sets import (
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
-from humangs_jax.people.baking import export_scan
+from humangs_jax.people.bank import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
-from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of, split_of
 from humangs_jax.people.sequences import sample_sequence
-from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, seeds_of, split_of
 
 HELD_OUT = "held_out"
 """Sub-folder of a subject's folder."""

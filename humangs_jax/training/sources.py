@@ -22,7 +22,7 @@ from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, Mixture, PeopleCache, Source
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
-from humangs_jax.people.seeds import SPLITS
+from humangs_jax.people.subject import SPLITS
 from humangs_jax.people.writer import find_people
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding

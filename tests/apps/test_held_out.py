@@ -6,8 +6,8 @@ import pytest
 
 from humangs_jax.apps import held_out
 from humangs_jax.apps.held_out import better_body, held_out_psnr
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.body.resolution import decimate
 from humangs_jax.network.presets import tiny
 from tests.refinement.refinement_cases import toy_avatar, toy_capture
 

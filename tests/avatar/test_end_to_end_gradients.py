@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -356,12 +356,7 @@ def every_gaussian_culled(case, point, fixed):
     return point | {"target_cameras": turned_away(point["target_cameras"])}, fixed
 
 
-DEGENERATE = (
-    nobody_in_the_photos,
-    subject_behind_the_cameras,
-    vertices_in_the_cameras,
-    every_gaussian_culled,
-)
+DEGENERATE = (nobody_in_the_photos, subject_behind_the_cameras, vertices_in_the_cameras, every_gaussian_culled)
 
 
 @pytest.mark.slow

@@ -44,10 +44,7 @@ MATRICES = {
 }
 AXES = {"y": [0, 1, 0], "-y": [0, -1, 0], "z": [0, 0, 1]}
 PREFIX = "KHR_gaussian_splatting:"
-SPZ_LOSSES = {
-    **{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255},
-    "SH_DEGREE_0_COEF_0": 0.51 / 255 / 0.15,
-}
+SPZ_LOSSES = {**{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255}, "SH_DEGREE_0_COEF_0": 0.51 / 255 / 0.15}
 """What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have twice."""
 TOOLS = Path(os.environ.get("HUMANGS_NPM", "."))
 """Folder where `npm install @playcanvas/splat-transform` was run; the environment variable HUMANGS_NPM."""
@@ -295,8 +292,7 @@ def small_file(folder):
 
 
 @pytest.mark.parametrize(
-    ("name", "axis"),
-    [("a.ply", [0, -1, 0]), ("a.splat", [0, -1, 0]), ("a.spz", [0, 1, 0]), ("a.glb", [0, 1, 0])],
+    ("name", "axis"), [("a.ply", [0, -1, 0]), ("a.splat", [0, -1, 0]), ("a.spz", [0, 1, 0]), ("a.glb", [0, 1, 0])]
 )
 def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monkeypatch, capsys):
     source = small_file(tmp_path)

@@ -18,9 +18,9 @@ from humangs_jax.avatar.reconstruct import (
     stack_captures,
     with_spread_weights,
 )
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, person_vertices, shape_body
+from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
@@ -364,9 +364,7 @@ def test_a_body_that_is_not_finite_is_an_error(body, network):
 def test_the_body_is_decimated_to_what_the_weights_want(body, network):
     variables, config = network
     avatar = reconstruct(
-        variables,
-        config.with_conventions(body_vertices=300).with_runtime(token_capacity=64),
-        capture(body, SIZE, SIZE),
+        variables, config.with_conventions(body_vertices=300).with_runtime(token_capacity=64), capture(body, SIZE, SIZE)
     )
     per_vertex = config.architecture.decoder.gaussians_per_vertex
     assert len(avatar.rest_vertices) == 300 and len(avatar.gaussians.means) == 300 * per_vertex

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from body_cases import areas, edge_counts, is_closed, made_up_body, signed_volume
 
-from humangs_jax.body.decimation import collapse_sequence, decimate, exposure
 from humangs_jax.body.model import shape_body
+from humangs_jax.body.resolution import collapse_sequence, decimate, exposure
 from humangs_jax.core.pytree import replace
 
 SAME_JOINTS = 1e-5  # metres: float32 sums of 200 vertices, and the ridge of the refit

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from rounding import bound
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.body.landmarks import Place, landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.body.places import Place
+from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67, mirrored_name
 
@@ -42,8 +41,7 @@ def bent():
 
 
 @pytest.mark.parametrize(
-    ("joints", "turned"),
-    [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))],
+    ("joints", "turned"), [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))]
 )
 def test_a_place_is_beside_its_joint_and_turns_with_its_bones(body, bent, joints, turned):
     places = (Place("left_elbow", "left_elbow", (0.03, 0.02, 0.0), joints),)

@@ -2,11 +2,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
-from humangs_jax.body.subdivision import split_long_edges, vertex_areas
+from humangs_jax.body.resolution import decimate, split_long_edges
 from humangs_jax.core.pytree import replace
+from humangs_jax.geometry.mesh import vertex_areas
 
 LONGEST = 0.05
 JOINT_TOLERANCE = 1e-6  # metres: joints are regressed from the same vertices

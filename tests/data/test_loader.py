@@ -26,7 +26,7 @@ from humangs_jax.data.loading import (
     shrink,
     subject_order,
 )
-from humangs_jax.data.loading.captures import read_boundary
+from humangs_jax.data.loading.captures import read_summary
 from humangs_jax.data.photos import read_view
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
@@ -81,7 +81,7 @@ def loader_of(cache, sampling, input_size, target_size, batch_size=1):
 
 def stored_subject(path, body):
     """A whole capture folder as the loader sees it."""
-    return CaptureCache([path], body).some_views(0, range(len(read_boundary(path, body).frames)))
+    return CaptureCache([path], body).some_views(0, range(len(read_summary(path, body).frames)))
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +226,7 @@ def test_captures_of_another_body_are_left_out(tmp_path):
     assert [greys(source.source.example(0, index, 2).inputs)[0][0] for index in range(4)] == [1] * 4
     assert "body: '../SMPLX_NEUTRAL.npz', but all captures of a run" in source.source.cache.broken[tmp_path / "smplx"]
     others = CaptureCache(find_captures(tmp_path), small_body(), body_file=tmp_path / "SMPLX_NEUTRAL.npz")
-    assert others.boundary(1) is not None and others.boundary(0) is None
+    assert others.summary(1) is not None and others.summary(0) is None
 
 
 def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
@@ -313,7 +313,7 @@ def test_views_whose_mask_is_empty_are_targets_but_no_inputs(folder, tmp_path):
 
 def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("humangs_jax.data.photos.read_view", None)
-    whole = read_boundary(folder / "s1", small_body())
+    whole = read_summary(folder / "s1", small_body())
     assert whole.images.shape == (0, SIZE, SIZE, 3) and whole.frames.tolist() == [0, 1, 0, 1, 0, 1]
 
     def broken(change):
@@ -321,7 +321,7 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
         shutil.copytree(folder / "s1", root)
         change(root)
         with pytest.raises(ValueError) as error:
-            read_boundary(root, small_body())
+            read_summary(root, small_body())
         return str(error.value)
 
     def flip(root):

@@ -16,12 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.data.loading import Example, Loader, Mixture, Source, Waiting
-from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
+from humangs_jax.data.loading.examples import MIX_BLOCK, block_counts, source_at
 from humangs_jax.data.sets import DATA_SET, SYNTHETIC, begin_set
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.on_the_fly import GeneratedSource
-from humangs_jax.people.seeds import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
+from humangs_jax.people.subject import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
 from humangs_jax.people.writer import find_people
 
 SIZE = 4

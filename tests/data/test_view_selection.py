@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from humangs_jax.body.decimation import decimate
-from humangs_jax.body.subdivision import vertex_areas
+from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import views as module
 from humangs_jax.data.capture import load_capture

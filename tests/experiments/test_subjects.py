@@ -6,7 +6,7 @@ import pytest
 from experiments import subjects as people
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import DEMO
 from humangs_jax.people.writer import Layout, write_person
 
 SIZE = 48

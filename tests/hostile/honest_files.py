@@ -19,7 +19,7 @@ from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.fitting.files import KEYS
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.network.weights import expected_variables, save_weights
-from humangs_jax.people.seeds import GENERATOR_VERSION
+from humangs_jax.people.subject import GENERATOR_VERSION
 from humangs_jax.training.config import tiny
 
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]

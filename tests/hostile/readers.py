@@ -32,7 +32,7 @@ from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.loading.captures import read_boundary
+from humangs_jax.data.loading.captures import read_summary
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
@@ -194,7 +194,7 @@ ROWS = {
     "settings": (load_settings, saved("settings.json", lambda path: save_settings(path, PRESETS["best"]))),
     "capture": (read_capture, honest.write_capture),
     "photos": (load_photos, honest.write_capture),
-    "boundary": (lambda path: read_boundary(path, honest.tiny_body()), honest.write_capture),
+    "boundary": (lambda path: read_summary(path, honest.tiny_body()), honest.write_capture),
     "transforms": (read_cameras, written("transforms.json", as_json(honest.transforms))),
     "opencv yaml": (read_cameras, written("cameras.yml", honest.opencv_yaml)),
     "opencv json": (read_cameras, written("calibration_full.json", as_json(RIG))),

@@ -10,8 +10,8 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.people import baking, cameras, rendering, subject, writer
-from humangs_jax.people.seeds import DEMO
+from humangs_jax.people import bank, cameras, rendering, subject, writer
+from humangs_jax.people.subject import DEMO
 from humangs_jax.rendering.mesh import atlas, rasterizer
 from humangs_jax.rendering.mesh.rasterizer import sample_texture
 
@@ -31,7 +31,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def baked(person):
-    return baking.bake_subject(person, SIZE)
+    return bank.bake_subject(person, SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_texels_are_spread_evenly(person, baked):
     worst = density[np.searchsorted(share, 0.01)]
     assert worst > LEAST_DENSITY
     assert 0.75 < np.median(density) < 1.01
-    assert density.max() < baking.FACE_DENSITY**2 * 1.01
+    assert density.max() < bank.FACE_DENSITY**2 * 1.01
     assert baked.atlas.texel < 0.007
 
 
@@ -93,7 +93,7 @@ def test_the_texture_says_what_the_materials_say(person, baked):
     look = lambda texture: np.asarray(sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None])))[0]
     error = np.abs(look(baked.albedo) / 255 - np.clip(albedo, 0, 1))
     assert np.median(error) < 0.01 and error.mean() < 0.04  # edges of patterns are a texel wide
-    bent = (look(baked.slopes) - baking.SLOPE_ZERO) * baking.SLOPE_STEP
+    bent = (look(baked.slopes) - bank.SLOPE_ZERO) * bank.SLOPE_STEP
     assert np.abs(bent - slopes).mean() < 0.05 * max(np.abs(slopes).mean(), 0.2)
 
 
@@ -101,7 +101,7 @@ def test_gaps_take_the_nearest_texel():
     known = np.zeros((4, 6), bool)
     known[1, 1] = known[2, 5] = True
     image = np.where(known[..., None], [[[2.0]], [[3.0]], [[5.0]], [[7.0]]], 0.0)
-    filled = baking.fill_gaps(image, known)
+    filled = bank.fill_gaps(image, known)
     assert filled[0, 0, 0] == 3.0 and filled[3, 5, 0] == 5.0
     assert set(np.unique(filled)) == {3.0, 5.0}
 
@@ -111,15 +111,15 @@ def test_a_few_joints_move_the_mesh_as_all_of_them(person):
     posed = writer.sample_pose(person, 3)
 
     def moved(count):
-        ids, weights = baking.strongest_joints(surface.weights, count)
+        ids, weights = bank.strongest_joints(surface.weights, count)
         np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
         few = np.zeros_like(surface.weights)
         np.put_along_axis(few, ids.astype(int), weights, axis=1)
         other = dataclasses.replace(person, surface=dataclasses.replace(surface, weights=few))
         return np.abs(other.posed_vertices(posed.rotations, posed.translation) - posed.vertices).max()
 
-    assert moved(baking.JOINTS_PER_VERTEX) < SKINNING
-    assert moved(2) > moved(baking.JOINTS_PER_VERTEX)
+    assert moved(bank.JOINTS_PER_VERTEX) < SKINNING
+    assert moved(2) > moved(bank.JOINTS_PER_VERTEX)
 
 
 def read_mesh(path) -> Any:
@@ -132,9 +132,9 @@ def read_mesh(path) -> Any:
 def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     posed = writer.sample_pose(person, 0)
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
-    folder = baking.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
+    folder = bank.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
     assert not list(tmp_path.glob(".*"))
-    known = json.loads((folder / baking.PARAMETERS).read_text())
+    known = json.loads((folder / bank.PARAMETERS).read_text())
     assert known["seed"] == person.seed and known["lit"]
     np.testing.assert_allclose(known["rotations"], posed.rotations)
     textures = []
@@ -146,7 +146,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
         np.testing.assert_allclose(mesh.visual.uv, baked.atlas.uvs, atol=1e-6)
         material = mesh.visual.material
         texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[..., :3]
-        np.testing.assert_array_equal(texture, baking.lit_texture(posed, baked))
+        np.testing.assert_array_equal(texture, bank.lit_texture(posed, baked))
         textures.append(texture)
     camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
     direct, mask = rendering.render_view(posed, camera)
@@ -162,7 +162,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
 
 
 def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
-    folder = baking.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
+    folder = bank.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
     assert sorted(file.name for file in folder.iterdir()) == ["scan.glb", "scan.json"]
     mesh = read_mesh(folder / "scan.glb")
     np.testing.assert_allclose(mesh.vertices, person.surface.vertices[baked.atlas.vertices], atol=1e-6)
@@ -171,15 +171,15 @@ def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
 
 def test_a_scan_is_written_whole_or_not_at_all(person, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="obj or glb"):
-        baking.export_scan(person, tmp_path / "scan", formats=("ply",))
+        bank.export_scan(person, tmp_path / "scan", formats=("ply",))
 
     def fail(*_):
         raise OSError("disk full")
 
     (tmp_path / "scan").mkdir()
     (tmp_path / "scan" / "scan.json").touch()
-    monkeypatch.setattr(baking, "_write_mesh", fail)
+    monkeypatch.setattr(bank, "_write_mesh", fail)
     with pytest.raises(OSError, match="disk full"):
-        baking.export_scan(person, tmp_path / "scan", texture_size=SIZE)
+        bank.export_scan(person, tmp_path / "scan", texture_size=SIZE)
     assert [path.name for path in tmp_path.iterdir()] == ["scan"]
     assert (tmp_path / "scan" / "scan.json").exists()

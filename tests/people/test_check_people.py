@@ -9,8 +9,7 @@ from experiments import generator as check_people
 from experiments.generator_poses import people_sheets
 from experiments.harness import call
 from humangs_jax.people import cameras
-from humangs_jax.people.seeds import DEMO
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import DEMO, make_subject
 from humangs_jax.people.writer import sample_pose
 
 SIZE = 96

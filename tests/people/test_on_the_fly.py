@@ -17,11 +17,10 @@ from humangs_jax.geometry.camera import project
 from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.presets import tiny
 from humangs_jax.people import cameras, on_the_fly, rendering, shading
+from humangs_jax.people.anatomy import joint_positions
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
-from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
-from humangs_jax.people.seeds import DEMO, TEST
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import DEMO, TEST, make_subject
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SEEDS = (DEMO[0], DEMO[4])

@@ -9,8 +9,7 @@ from humangs_jax.people import outfits, shading, subject
 from humangs_jax.people.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
 from humangs_jax.people.fabrics import Material, Spots
 from humangs_jax.people.hair import BEARDS, CUTS
-from humangs_jax.people.seeds import DEMO
-from humangs_jax.people.subject import HEIGHT_RANGE, YEARS, describe
+from humangs_jax.people.subject import DEMO, HEIGHT_RANGE, YEARS, describe
 from humangs_jax.people.trimmings import EMBLEMS, bitmap, emblem, written
 
 MILLIMETRES = 4e-3

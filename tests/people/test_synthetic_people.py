@@ -7,9 +7,9 @@ import pytest
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.people import cameras, fabrics, rendering, subject, writer
+from humangs_jax.people.anatomy import LEFT_HIP, LEFT_KNEE
 from humangs_jax.people.fabrics import PATTERNS
-from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE
-from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import DEMO
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SEEDS = [DEMO[i] for i in range(6)]

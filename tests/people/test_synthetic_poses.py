@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from experiments.generator_poses import OverlapMeter, winding_numbers
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
-from humangs_jax.people import kinematics as kin
+from humangs_jax.people import anatomy as kin
 from humangs_jax.people.poses import STANCES, arm_clearance, pose_hand, sample_rotations, take_stance
 
 CLOSE = 1e-4

@@ -7,7 +7,7 @@ import pytest
 
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.motion import Motion, load_motion, save_motion
-from humangs_jax.people import kinematics as kin
+from humangs_jax.people import anatomy as kin
 from humangs_jax.people.poses import arm_clearance
 from humangs_jax.people.sequences import KINDS, sample_sequence
 

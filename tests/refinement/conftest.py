@@ -3,8 +3,8 @@
 import pytest
 from refinement_cases import toy_avatar, toy_capture
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.body.resolution import decimate
 from humangs_jax.refinement import search
 from humangs_jax.rendering.splat_config import SplatConfig
 

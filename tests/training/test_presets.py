@@ -16,7 +16,7 @@ from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.people.bank import build_bank
-from humangs_jax.people.seeds import SPLITS
+from humangs_jax.people.subject import SPLITS
 from humangs_jax.training.config import PRESETS, fitting_losses
 from humangs_jax.training.sources import captured_people, mixed_people, on_the_fly_people, people_on_disk, stage_loader
 from humangs_jax.training.state import init_state

@@ -15,12 +15,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import (
-    CalibratedCamera,
-    Calibration,
-    brown_conrady,
-    in_capture_convention,
-)
+from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, brown_conrady, in_capture_convention
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.bodies import (
     FARTHEST,

@@ -139,7 +139,7 @@ class Person:
         """The subject. Raises: ValueError, naming file and field."""
         return self.open()
 
-    def boundary(self) -> StoredSubject:
+    def summary(self) -> StoredSubject:
         """All of it but pixels and poses."""
         subject, every = self.subject, np.arange(len(self.subject))
         R, t = subject.cam_from_world[:, :3, :3], subject.cam_from_world[:, :3, 3]

@@ -16,7 +16,7 @@ Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data form
 
 import dataclasses
 
-from humangs_jax.body.places import Place, both_sides, place
+from humangs_jax.body.landmarks import Place, both_sides, place
 
 SIDES = ("left", "right")
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")

@@ -5,20 +5,20 @@ A `Source` has examples by number: `CaptureSource` (people on disk: capture fold
 each process the rows of its devices, some batches ahead.
 """
 
-from humangs_jax.data.loading.batches import Loader
+from humangs_jax.data.loading.batches import Loader, Waiting
 from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, PeopleCache, find_captures
 from humangs_jax.data.loading.examples import (
     Example,
+    Mixture,
     Source,
     StoredSubject,
     ViewSampling,
     draw_views,
     nearest_view,
     shrink,
+    subject_order,
     subject_views,
 )
-from humangs_jax.data.loading.order import Mixture, subject_order
-from humangs_jax.data.loading.threads import Waiting
 
 __all__ = [
     "CaptureCache",

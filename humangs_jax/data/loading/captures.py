@@ -13,8 +13,16 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import UInt8
 from humangs_jax.data.capture import DEFAULT_BODY, load_capture, read_parameters
 from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
-from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
-from humangs_jax.data.loading.order import subject_order, view_generator
+from humangs_jax.data.loading.examples import (
+    Example,
+    StoredSubject,
+    ViewSampling,
+    draw_views,
+    shrink,
+    subject_order,
+    subject_views,
+    view_generator,
+)
 from humangs_jax.data.photos import check_photos, read_checked, read_description, read_frames_and_matrices
 from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import check_image, to_uint8
@@ -35,7 +43,7 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def read_boundary(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
+def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
     """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
 
     Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
@@ -114,16 +122,16 @@ class StoredPerson(Protocol):
         """What the log and `broken` call it."""
         ...
 
-    def boundary(self) -> StoredSubject:
+    def summary(self) -> StoredSubject:
         """All of it but pixels, perhaps without poses. Raises: ValueError or OSError if it cannot be used."""
         ...
 
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """Images and masks of these views. Raises: as `boundary`."""
+        """Images and masks of these views. Raises: as `summary`."""
         ...
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """Some views of the silhouette, with at least the poses that they show. Raises: as `boundary`."""
+        """Some views of the summary, with at least the poses that they show. Raises: as `summary`."""
         ...
 
 
@@ -135,9 +143,9 @@ class CaptureFolder:
     body: BodyModel
     body_file: str | Path = DEFAULT_BODY
 
-    def boundary(self) -> StoredSubject:
-        """See `read_boundary`."""
-        return read_boundary(self.name, self.body, self.body_file)
+    def summary(self) -> StoredSubject:
+        """See `read_summary`."""
+        return read_summary(self.name, self.body, self.body_file)
 
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
         """See `StoredPerson`."""
@@ -147,7 +155,7 @@ class CaptureFolder:
         return to_uint8(capture.images), to_uint8(capture.masks)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """The same: the silhouette has all poses."""
+        """The same: the summary has all poses."""
         return subject
 
 
@@ -164,7 +172,7 @@ class PeopleCache:
         self.broken: dict[Path | str, str] = {}
         self._free_bytes = limit_bytes
         self._left_out: set[Path | str] = set()
-        self._boundaries: dict[Path | str, StoredSubject] = {}
+        self._summaries: dict[Path | str, StoredSubject] = {}
         self._images: dict[tuple[Path | str, int], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
@@ -175,37 +183,37 @@ class PeopleCache:
         """What errors call person `index`."""
         return self.people[index].name
 
-    def boundary(self, index: int) -> StoredSubject | None:
+    def summary(self, index: int) -> StoredSubject | None:
         """Person `index` without images, see `StoredPerson`; None if it is broken, which is reported once."""
         name = self.name(index)
         with self._lock:
             if name in self._left_out:
                 return None
-            if name in self._boundaries:
-                return self._boundaries[name]
+            if name in self._summaries:
+                return self._summaries[name]
         try:
-            boundary = self.people[index].boundary()
+            summary = self.people[index].summary()
         except (ValueError, OSError) as error:
             self.report(index, str(error))
             return None
         with self._lock:
-            return self._boundaries.setdefault(name, boundary)
+            return self._summaries.setdefault(name, summary)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
         """Person `index` with these views alone, in this order. Raises: ValueError naming file and field."""
         person, name = self.people[index], self.name(index)
         with self._lock:
-            boundary = self._boundaries.get(name)
+            summary = self._summaries.get(name)
             decoded = {view: self._images[name, view] for view in views if (name, view) in self._images}
-        boundary = person.boundary() if boundary is None else boundary
+        summary = person.summary() if summary is None else summary
         if missing := [view for view in views if view not in decoded]:
             for view, image, mask in zip(missing, *person.decode(missing), strict=True):
                 decoded[view] = image, mask
                 self._keep(name, view, image, mask)
         chosen = np.asarray(views)
         images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
-        of_views = {name: getattr(boundary, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
-        return person.posed(boundary._replace(images=images, masks=masks, **of_views))
+        of_views = {name: getattr(summary, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
+        return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
         """Record person `index` as broken, and log it the first time; other views of it are still used."""
@@ -295,13 +303,13 @@ class CaptureSource:
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
         for subject_index in np.roll(order, -position).tolist():
-            boundary = self.cache.boundary(subject_index)
-            if boundary is None:
+            summary = self.cache.summary(subject_index)
+            if summary is None:
                 continue
             try:
-                inputs, targets = draw_views(view_generator(seed, index), boundary, input_count, self.sampling)
+                inputs, targets = draw_views(view_generator(seed, index), summary, input_count, self.sampling)
                 for size in (self.input_size, self.target_size):
-                    shrink(boundary.images, size)  # without views: whether images of this size can be shrunk so
+                    shrink(summary.images, size)  # without views: whether images of this size can be shrunk so
             except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.name(subject_index)}: {error}")
                 continue

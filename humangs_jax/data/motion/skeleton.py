@@ -50,6 +50,7 @@ from humangs_jax.data.motion.rules import (
     up_axis,
     upright_matrix,
 )
+from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.reading import Refused
 
 
@@ -124,7 +125,7 @@ def _up_of(clip, source, scale, standing):
     """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people stand does."""
     usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
     trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
-    axis, cosine = nearest_axis(_unit(trunk).mean(axis=0))
+    axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
     chosen = sampled_frames(len(clip.places))
     points = scale * clip.places[chosen][:, sorted(source.values())]
     return up_axis(points, axis if cosine >= CLEARLY_UP else None, usual, clip.fps)
@@ -186,12 +187,12 @@ def _top(source):
 
 
 def _spine(clip, source):
-    return _unit(clip.rest[source[_top(source)]] - clip.rest[source["pelvis"]])
+    return unit(clip.rest[source[_top(source)]] - clip.rest[source["pelvis"]])
 
 
 def _stands(clip, source):
     legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in SIDES)
-    return float(_unit(legs) @ _spine(clip, source)) < STANDING
+    return float(unit(legs) @ _spine(clip, source)) < STANDING
 
 
 def _body_turns(clip, source, joints, turns, places, by_motion):
@@ -207,12 +208,12 @@ def _body_turns(clip, source, joints, turns, places, by_motion):
         elif child is None:
             world.append(turns[:, source[name]] @ align)
         else:
-            bone = _unit(joints[_INDEX[child]] - joints[j])
-            align = _smallest_turns(align @ bone, _unit(clip.rest[source[child]] - clip.rest[source[name]])) @ align
+            bone = unit(joints[_INDEX[child]] - joints[j])
+            align = smallest_turns(align @ bone, unit(clip.rest[source[child]] - clip.rest[source[name]])) @ align
             if by_motion:
                 align = align @ _untwist(_transposed(world[parent]) @ turns[:, source[name]] @ align, bone)
             own = turns[:, source[name]] @ align
-            world.append(_smallest_turns(own @ bone, _unit(places[:, source[child]] - places[:, source[name]])) @ own)
+            world.append(smallest_turns(own @ bone, unit(places[:, source[child]] - places[:, source[name]])) @ own)
         frames_of.append(align)
     return world
 
@@ -225,11 +226,11 @@ def _pelvis_turns(clip, source, turns, places):
     rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
 
     def meeting(candidate):
-        return _smallest_turns(_unit(candidate @ rest_line), _unit(line)) @ candidate
+        return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
         """(m,) angle about the line of the hips from the rest pose's direction of a joint above to the frame's."""
-        axis = _unit(line)
+        axis = unit(line)
         across = lambda v: v - np.sum(v * axis, axis=-1, keepdims=True) * axis
         a = across(candidate @ (clip.rest[top] - clip.rest[pelvis]))
         b = across(places[:, top] - places[:, pelvis])
@@ -250,7 +251,7 @@ def _pelvis_turns(clip, source, turns, places):
     tilt = tilts(own, lowest)
     if np.abs(tilt).mean() <= LARGEST_BEND:
         return own
-    return Rotation.from_rotvec(tilt[:, None] * _unit(line)).as_matrix() @ own
+    return Rotation.from_rotvec(tilt[:, None] * unit(line)).as_matrix() @ own
 
 
 def _pelvis_frame(clip, source, joints):
@@ -262,19 +263,9 @@ def _pelvis_frame(clip, source, joints):
 
 
 def _frame(right, up):
-    x = _unit(right)
-    z = _unit(np.cross(x, up))
+    x = unit(right)
+    z = unit(np.cross(x, up))
     return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def _smallest_turns(a, b):
-    """The rotation matrices (..., 3, 3) that turn unit vectors a into b by the smallest angle; none where b is zero."""
-    a, b = np.broadcast_arrays(a, b)
-    cosine = np.sum(a * b, axis=-1, keepdims=True)
-    side = _unit(np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])))
-    opposite = np.concatenate([side, np.zeros_like(cosine)], axis=-1)
-    turn = np.where(cosine < -0.999999, opposite, np.concatenate([np.cross(a, b), 1 + cosine], axis=-1))
-    return Rotation.from_quat(turn.reshape(-1, 4)).as_matrix().reshape(*a.shape, 3)
 
 
 def _untwist(turns, bone):
@@ -333,10 +324,6 @@ def _steps_of_body(world, joints, moves, source):
 
     feet = [_INDEX[name] for kind in _feet(source) for name in kind]
     return np.min([place(j)[:, 1] - (joints[j, 1] - joints[feet, 1].min()) for j in feet], axis=0)
-
-
-def _unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def _transposed(matrices):

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.geometry.mesh import smallest_turns
 
 T = TypeVar("T")
 
@@ -36,14 +37,7 @@ def smallest_rotation(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
     lengths = np.linalg.norm(start), np.linalg.norm(end)
     if not min(lengths) > 0:
         raise ValueError("the direction from pelvis to neck has no length")
-    a, b = start / lengths[0], end / lengths[1]
-    v, c = np.cross(a, b), float(a @ b)
-    if c < -1 + 1e-12:  # half a turn about any axis across
-        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        axis /= np.linalg.norm(axis)
-        return 2 * np.outer(axis, axis) - np.eye(3)
-    cross = np.asarray([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + c)
+    return smallest_turns(start / lengths[0], end / lengths[1], opposite=1e-24)
 
 
 def box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:

@@ -16,6 +16,7 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt8
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.data.preprocess.protocol import VERTICAL_FOV, intrinsics
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.mesh import face_areas, face_crosses
 from humangs_jax.io.images import to_uint8
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, sample_texture
 
@@ -44,8 +45,8 @@ class ScanRenderer:
         spare, spare_faces = -len(vertices) % STEP, -len(scan.faces) % STEP
         pad = lambda x: jnp.asarray(np.pad(x, ((0, spare), (0, 0)), mode="edge"), jnp.float32)
         faces = jnp.asarray(np.pad(scan.faces, ((0, spare_faces), (0, 0))), jnp.int32)
-        surface = _areas(vertices, scan.faces)
-        flat = _areas(np.pad(scan.uvs.astype(np.float64), ((0, 0), (0, 1))), scan.faces)
+        surface = face_areas(vertices, scan.faces).sum()
+        flat = face_areas(np.pad(scan.uvs.astype(np.float64), ((0, 0), (0, 1))), scan.faces).sum()
         height, width = scan.texture.shape[:2]
         texel = float(np.sqrt(surface / max(flat, 1e-12) / (height * width)))
         return cls(pad(vertices), pad(smooth_normals(vertices, scan.faces)), faces, pad(scan.uvs), scan, texel)
@@ -78,17 +79,11 @@ class ScanRenderer:
         return halved
 
 
-def _areas(vertices, faces):
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
 def smooth_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
     """Unit normals; vertices at one place, which texture seams double, share theirs. Zero where there is no face."""
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    of_faces = np.cross(b - a, c - a)
+    of_faces = face_crosses(vertices, faces)
     sums = np.stack(
         [np.bincount(place[faces].reshape(-1), np.repeat(of_faces[:, k], 3), len(vertices)) for k in range(3)], -1
     )

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.body.surface_points import SurfacePoints
+from humangs_jax.body.skinning import SurfacePoints
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.residuals.boundaries import Boundary, inside_image

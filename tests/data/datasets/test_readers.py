@@ -176,7 +176,7 @@ def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
         open_people(folder, FileBody.load())
     (person,) = open_people(write_avatarrex(tmp_path / "a"), FileBody.load())
     with pytest.raises(ValueError, match=r"smpl_params.npz: betas: of SMPL-X, and body 'makehuman'"):
-        person.boundary()
+        person.summary()
 
 
 def test_a_turned_world_moves_the_posed_body_along(body):
@@ -200,7 +200,7 @@ def test_five_thousand_frames_open_in_under_a_second(tmp_path, body):
     for _ in range(3):  # other programs may take the processor
         began = time.process_time()
         (person,) = open_people(folder, body, SIZE)
-        assert len(person.boundary().frames) == count + 1
+        assert len(person.summary().frames) == count + 1
         spent.append(time.process_time() - began)
     assert min(spent) < 1
     assert person.subject.photo(0, SIZE)[0].shape == (SIZE, SIZE, 3)

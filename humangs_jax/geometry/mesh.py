@@ -1,0 +1,44 @@
+"""Triangles and directions on the host, by numpy in float64 where they are."""
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float, Int
+
+
+def face_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """The normal of each face, twice its area long; outwards where corners go round counter-clockwise."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def face_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
+    """Areas of the faces, in the unit of the vertices squared."""
+    return 0.5 * np.linalg.norm(face_crosses(vertices, faces), axis=-1)
+
+
+def vertex_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " n"]:
+    """A third of the area of the faces around each vertex."""
+    return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Vectors over their lengths; those without length as they are."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def smallest_turns(
+    a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], opposite: float = 1e-6
+) -> Float[np.ndarray, "*n 3 3"]:
+    """The rotation matrices that turn unit vectors a into b by the smallest angle; none where one is zero.
+
+    Where 1 + a.b is less than `opposite`, it is half a turn about some axis across a.
+    """
+    from scipy.spatial.transform import Rotation
+
+    a, b = np.broadcast_arrays(a, b)
+    real = 0.5 * np.sum((a + b) ** 2, axis=-1, keepdims=True)  # 1 + a.b without cancellation
+    real = np.where((a == 0).all(axis=-1, keepdims=True) | (b == 0).all(axis=-1, keepdims=True), 1.0, real)
+    side = unit(np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])))
+    half = np.concatenate([side, np.zeros_like(real)], axis=-1)
+    turn = np.where(real < opposite, half, np.concatenate([np.cross(a, b), real], axis=-1))
+    return Rotation.from_quat(turn.reshape(-1, 4)).as_matrix().reshape(*a.shape, 3)

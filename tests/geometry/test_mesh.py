@@ -1,0 +1,39 @@
+"""Areas and normals of known surfaces; the smallest turn between any two directions."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from humangs_jax.geometry.mesh import face_areas, face_crosses, smallest_turns, unit, vertex_areas
+
+EXACT = 1e-9
+directions = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.asarray).filter(lambda v: np.abs(v).max() > 1e-3)
+
+
+def test_a_sphere_has_its_area_and_its_normals_point_outwards():
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
+    vertices, faces = np.asarray(sphere.vertices), np.asarray(sphere.faces)
+    assert face_areas(vertices, faces).sum() == pytest.approx(16 * np.pi, rel=0.01)  # of the polyhedron in it
+    assert vertex_areas(vertices, faces).sum() == pytest.approx(sphere.area)
+    crosses = face_crosses(vertices, faces)
+    np.testing.assert_allclose(np.linalg.norm(crosses, axis=1), 2 * sphere.area_faces, atol=EXACT)
+    assert (np.sum(unit(crosses) * unit(vertices[faces].mean(axis=1)), axis=1) > 0.99).all()
+    assert not unit(np.zeros((2, 3))).any()
+
+
+@given(directions, directions)
+def test_the_smallest_turn_takes_one_direction_to_the_other(a, b):
+    a, b = unit(np.stack([a, b]))
+    turn = smallest_turns(a, b, opposite=1e-24)
+    np.testing.assert_allclose(turn @ a, b, atol=1e-7)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=EXACT)
+    angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
+    assert np.trace(turn) == pytest.approx(1 + 2 * np.cos(angle), abs=1e-7)  # no more than that angle
+
+
+def test_opposite_directions_are_half_a_turn_apart_and_nothing_turns_nothing():
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    np.testing.assert_allclose(np.einsum("nab,nb->na", smallest_turns(axes, -axes), axes), -axes, atol=EXACT)
+    np.testing.assert_array_equal(smallest_turns(np.zeros(3), axes), np.broadcast_to(np.eye(3), (6, 3, 3)))
