@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -16,6 +16,11 @@ from humangs_jax.data.formats import MOTIONS
 
 TURN_SECONDS = 4.0
 """A turntable as a video turns once in this time."""
+if TYPE_CHECKING:
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.geometry.camera import Camera
+
 RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
 """Of frames per second, and of any number."""
 VIDEO = Place(VIDEOS.suffixes, folder=True)
@@ -145,7 +150,7 @@ class Render:
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
 
-    def _require_defaults(self):
+    def _require_defaults(self) -> None:
         """With --capture nothing is said about the cameras. Raises: UsageError naming the first option that does."""
         free, usual = ("background", "splat", "prune"), Shot()
         said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
@@ -199,13 +204,13 @@ class View:
         serve(text, self.port, self.browser)
 
 
-def _drawn_by(shot, preset, config):
+def _drawn_by(shot: Shot, preset: Preset | None, config: Path | None) -> Shot:
     """The shot, drawn as a preset or a file of settings says."""
     settings = chosen_settings(preset, config)
     return shot if settings is None else settings.shot(shot)
 
 
-def _pruned(avatar, poses, cameras, shot):
+def _pruned(avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: Shot) -> "Avatar":
     """Without what no image shows, if asked, which is said."""
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
@@ -218,6 +223,6 @@ def _pruned(avatar, poses, cameras, shot):
     return seen
 
 
-def _size(shot):
+def _size(shot: Shot) -> str:
     width, height = shot.resolution
     return f"{width} x {height}"

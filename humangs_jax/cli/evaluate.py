@@ -1,6 +1,7 @@
 """`humangs evaluate`: scores of reconstructions, avatars or any program's images under a protocol."""
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -97,7 +98,7 @@ class Evaluate:
         if self.html is None:
             suggest("humangs evaluate", self.source, *self._given(), "--html scores.html")
 
-    def _given(self):
+    def _given(self) -> Iterator[str | Path]:
         """The options that say what is evaluated and how, as they were given."""
         names = ("avatar", "weights", "predictions", "protocol", "body", "inputs", "indices")
         options = {f"--{name}": getattr(self, name) for name in names if getattr(self, name) is not None}

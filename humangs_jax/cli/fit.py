@@ -4,6 +4,7 @@ Everything is checked before the work begins, and written after it.
 """
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -113,7 +114,7 @@ class Fit:
         else:
             self._fit_keypoints()
 
-    def _given(self):
+    def _given(self) -> Iterator[str]:
         """Options of the ways of fitting whose value is not the default, in the order of the help."""
         for part in (self.refinement, self.scan, self.detections, self):
             for field in dataclasses.fields(part):
@@ -121,7 +122,7 @@ class Fit:
                 if chosen and field.name not in ("capture", "out", "overwrite"):
                     yield field.name
 
-    def _check_places(self, way):
+    def _check_places(self, way: Way) -> None:
         """Whether the result can be written; the whole of it is checked again where the capture is known."""
         scan, keypoints = self.scan, self.detections.keypoints
         inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
@@ -136,7 +137,7 @@ class Fit:
             if (body := self.capture / "body.npz").exists() and not self.overwrite:
                 raise UsageError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
 
-    def _fit_keypoints(self):
+    def _fit_keypoints(self) -> None:
         assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.body.library import load_body
@@ -175,7 +176,7 @@ class Fit:
         wrote(target, "body.npz, fit.npz and fit.json")
         suggest("humangs check", target)
 
-    def _refine(self):
+    def _refine(self) -> None:
         assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
@@ -206,7 +207,7 @@ class Fit:
         wrote(target, "refined cameras and body")
         suggest("humangs check", target)
 
-    def _fit_scan(self):
+    def _fit_scan(self) -> None:
         scan, keypoints = self.scan, self.detections.keypoints
         if scan.joints is not None and scan.views is not None:
             raise UsageError("--joints and --views: give one of them, both say where the joints are")

@@ -16,6 +16,7 @@ import time
 import traceback
 import warnings
 from pathlib import Path
+from types import FrameType
 from typing import TextIO
 
 from humangs_jax.cli import INTERRUPTED
@@ -82,7 +83,7 @@ def end_within_seconds() -> None:
     sys.unraisablehook = dropped
 
 
-def _importing(frame):
+def _importing(frame: FrameType | None) -> bool:
     """Whether a module is being imported: extensions that are interrupted while they begin crash, or raise other errors."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):

@@ -119,7 +119,7 @@ def _classes(annotation: Any) -> tuple[type, ...]:
     return options if all(plain) and all(known) and not any(protocol) else ()
 
 
-def _call(function, signature):
+def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
     """The function with its parameters: those without a default, the others as dots."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = signature.parameters.values()
@@ -128,7 +128,7 @@ def _call(function, signature):
     return f"{getattr(function, '__name__', 'function')}({', '.join(needed + more)})"
 
 
-def _other_class(classes, value):
+def _other_class(classes: tuple[type, ...], value: Any) -> str:
     names = [x.__name__ for x in classes if x is not type(None)]
     given = "None" if value is None else value.__name__ if isinstance(value, type) else type(value).__name__
     shown = (
@@ -138,7 +138,7 @@ def _other_class(classes, value):
     return f"expected {' or '.join(names)}, got{shown}{f'; {hint}' if hint else ''}"
 
 
-def _of_a_field(keywords, signature, expected):
+def _of_a_field(keywords: Any, signature: inspect.Signature, expected: dict[str, tuple[type, ...]]) -> str | None:
     """Where a name belongs that the function does not have: into one of its configurations."""
     for name in keywords:
         if name in signature.parameters:
@@ -196,12 +196,12 @@ def check_values(
 
 
 @jax.jit
-def _extremes(arrays):
+def _extremes(arrays: tuple[Array, ...]) -> Array:
     """(arrays, 2): least and largest entry of each; both NaN if an entry is."""
     return jnp.stack([jnp.stack([jnp.min(array), jnp.max(array)]) for array in arrays])
 
 
-def _fault(array, values):
+def _fault(array: np.ndarray, values: Values) -> str:
     wrong = ~(np.isfinite(array) & (array >= values.low) & (array <= values.high))
     first = np.argwhere(wrong)[0]
     place = f"the first at {first.tolist()}: " if array.ndim else ""

@@ -49,11 +49,11 @@ def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None
     return cache
 
 
-def _folder_of_jax():
+def _folder_of_jax() -> str | None:
     return sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX)
 
 
-def _user_cache():
+def _user_cache() -> Path:
     if folder := os.environ.get("XDG_CACHE_HOME"):
         return Path(folder)
     if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
@@ -61,7 +61,7 @@ def _user_cache():
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
 
-def _processor():
+def _processor() -> str:
     """A short mark of the processor and its instructions: machines of a cluster share a home, not their programs."""
     about = platform.machine() + platform.processor()
     with contextlib.suppress(OSError):

@@ -58,7 +58,7 @@ def peak_memory() -> Generator[list[float | None]]:
         result[0] = max(0.0, _status("VmHWM") - before)
 
 
-def _status(name):
+def _status(name: str) -> float:
     """A line of /proc/self/status, MiB."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:"))
@@ -133,7 +133,7 @@ def in_processes(
             raise
 
 
-def _begin(prepare, given):
+def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
     """One thread each: the processes are the parallelism."""
     import signal
 
@@ -156,6 +156,6 @@ def end_with_parent() -> None:
         threading.Thread(target=_wait, args=(parent.sentinel,), daemon=True).start()
 
 
-def _wait(sentinel):
+def _wait(sentinel: int) -> None:
     connection.wait([sentinel])
     os._exit(1)

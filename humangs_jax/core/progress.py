@@ -39,11 +39,11 @@ def printable(text: object, lines: bool = False) -> str:
     return "".join(c if c.isprintable() or c in kept or _harmless(c) else _escaped(c) for c in text)
 
 
-def _harmless(c):
+def _harmless(c: str) -> bool:
     return c in JOINERS or unicodedata.category(c) in SHOWN
 
 
-def _escaped(c):
+def _escaped(c: str) -> str:
     if "\udc80" <= c <= "\udcff":  # a byte of a file name, as os.fsdecode has it
         return f"\\x{ord(c) - 0xDC00:02x}"
     return c.encode("unicode_escape").decode("ascii")
@@ -172,7 +172,7 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
     return made
 
 
-def _close(bars):
+def _close(bars: set[Any]) -> None:
     for each in bars:
         each.close()
 
@@ -182,7 +182,7 @@ def watched() -> bool:
     return _current.ticking
 
 
-def _tick(current, stop, started):
+def _tick(current: Progress, stop: threading.Event, started: float) -> None:
     while not stop.wait(TICK):
         if not current.paused and current.names:
             name = ": ".join(dict.fromkeys((current.names[0], current.names[-1])))

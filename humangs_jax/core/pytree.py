@@ -69,7 +69,7 @@ def short_repr(tree: Any) -> str:
     return f"{type(tree).__name__}({', '.join(shown)})"
 
 
-def _shortened(value):
+def _shortened(value: Any) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         kind = np.dtype(value.dtype) if isinstance(value, np.ndarray) else value.dtype
         name = kind.name.replace("bfloat", "bf").replace("float", "f").replace("uint", "u").replace("int", "i")
@@ -128,7 +128,7 @@ class Batchable:
         return map(self.__getitem__, range(len(self)))
 
 
-def _annotated_rank(annotation):
+def _annotated_rank(annotation: Any) -> int | None:
     """Number of axes in a jaxtyping annotation, or in that of an optional array; None for any other annotation."""
     for option in typing.get_args(annotation) or (annotation,):
         dims = getattr(option, "dims", None)
@@ -166,7 +166,7 @@ def shape_fault(tree: Any) -> str | None:
 
 
 @functools.cache
-def _annotated_axes(cls):
+def _annotated_axes(cls: Any) -> dict[str, list[Any] | None]:
     """By field: its axes, names and sizes, or None where it is no array (a pytree of its own, or static)."""
     fields = [field for field in dataclasses.fields(cls) if not field.metadata.get("static")]
     found = {}

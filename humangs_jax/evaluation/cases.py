@@ -14,7 +14,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.bodies import FileBody
@@ -133,7 +133,7 @@ def _load(
     return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
 
 
-def _model(body):
+def _model(body: BodyModel | str | Path | None) -> BodyModel | None:
     return load_body(body) if isinstance(body, str | Path) else body
 
 
@@ -324,7 +324,7 @@ def _prediction(place: Path, name: str, index: int) -> Path | None:
     return next((file for file in candidates if file.is_file()), None)
 
 
-def _read_prediction(file, size, background):
+def _read_prediction(file: Path, size: tuple[int, int], background: float) -> tuple[np.ndarray, np.ndarray | None]:
     image, alpha = read_image(file)
     if image.shape[:2] != size:
         sizes = " x ".join(map(str, image.shape[1::-1])), " x ".join(map(str, size[::-1]))
@@ -399,10 +399,10 @@ def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.n
     return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
 
 
-def _posed_vertices(capture, rest, frame):
+def _posed_vertices(capture: Capture, rest: RestBody, frame: int) -> Float[Array, "n 3"]:
     return _pose(capture.body, rest, capture.pose(frame))
 
 
 @jax.jit
-def _pose(body, rest, pose: BodyPose):
+def _pose(body: BodyModel, rest: RestBody, pose: BodyPose) -> Float[Array, "n 3"]:
     return pose_body(body, rest, pose).vertices

@@ -8,6 +8,7 @@ count, and LPIPS sees zeros where its convolutions would.
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +74,7 @@ def person_scores(
     }, kept
 
 
-def _patch_means(x, side):
+def _patch_means(x: Float[Array, "h w"], side: int) -> Float[Array, "y x"]:
     """The mean of every square of that side, `STRIDE` apart."""
     return lax.reduce_window(x, 0.0, lax.add, (side, side), (STRIDE, STRIDE), "VALID") / side**2
 
@@ -84,7 +85,7 @@ def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[
     return {"iou": silhouette_iou(alpha, mask), "semi_transparent": semi_transparent(alpha, mask)}
 
 
-def _precise_lpips(weights, predicted, truth, size=None):
+def _precise_lpips(weights: Lpips, predicted: Any, truth: Any, size: Any = None) -> Scalar:
     with jax.default_matmul_precision("highest"):  # accelerators round the factors of convolutions by default
         return lpips(weights, predicted, truth, size)
 
@@ -140,13 +141,13 @@ def score_image(
     return {name: None if value is None else float(value) for name, value in row.items()}
 
 
-def _padded(image):
+def _padded(image: np.ndarray) -> Array:
     """With zeros below and right, up to a size that many images share; on the device."""
     missing = [(0, round_up(side) - side) for side in image.shape[:2]]
     return jnp.asarray(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
 
 
-def _patch_lpips(weights, predicted, truth, corners):
+def _patch_lpips(weights: Lpips, predicted: np.ndarray, truth: np.ndarray, corners: np.ndarray) -> float:
     """The mean over the patches with these upper left corners."""
     pairs = [np.stack([x[i : i + PATCH, j : j + PATCH] for i, j in corners]) for x in (predicted, truth)]
     total, count = 0.0, len(corners)

@@ -185,6 +185,6 @@ def csv_text(rows: Sequence[Scored]) -> str:
     return text.getvalue()
 
 
-def _cell(name):
+def _cell(name: str) -> str:
     name = printable(name)
     return f"'{name}" if name.lstrip()[:1] in _FORMULAS else name

@@ -98,7 +98,7 @@ def from_matrix(m: Float[Array, "*b 3 3"], smallest: float = 0.1) -> Float[Array
     return jnp.take_along_axis(candidates, best, axis=-2)[..., 0, :]
 
 
-def _sine_and_cosine_ratios(angle_squared):
+def _sine_and_cosine_ratios(angle_squared: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
     small = angle_squared < SMALL_ANGLE_SQUARED
     squared = jnp.where(small, 1.0, angle_squared)
@@ -164,7 +164,9 @@ def left_singular_vectors(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3
     return _complete_to_rotation(jnp.stack(columns, axis=-1), norms), norms
 
 
-def _orthogonalize(a, b):
+def _orthogonalize(
+    a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Rotate two columns in their plane until they are orthogonal."""
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0
@@ -177,7 +179,7 @@ def _orthogonalize(a, b):
     return cosine * a - sine * b, sine * a + cosine * b
 
 
-def _complete_to_rotation(columns, norms):
+def _complete_to_rotation(columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """Normalise the two longest columns and take their cross product as the third: proper even where columns vanish."""
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]

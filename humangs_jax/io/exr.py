@@ -11,6 +11,7 @@ import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool =
         raise OSError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
-def _to_part(view, name, half):
+def _to_part(view: ExrView, name: str, half: bool) -> Any:
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     height, width = view.rgba.shape[:2]

@@ -81,11 +81,11 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         return (codes > 0).astype(np.float32)
 
 
-def _is_grey(colors):
+def _is_grey(colors: np.ndarray) -> bool:
     return float(np.ptp(colors, axis=-1).max()) <= GREY_SLACK
 
 
-def _mask_of_labels(labels, palette):
+def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """The mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to 255."""
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
@@ -106,7 +106,7 @@ def _mask_of_labels(labels, palette):
     raise Refused(f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}")
 
 
-def _mask_of_alpha(colors, alpha):
+def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     shown = colors[alpha > 0]
     flat = not len(shown) or np.ptp(shown, axis=0).max() <= GREY_SLACK
     if flat or not _is_grey(shown) or np.abs(shown[:, 0] - alpha[alpha > 0]).max() <= GREY_SLACK:
@@ -133,7 +133,7 @@ def focal_length(path: str | Path) -> float | None:
         return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
 
 
-def _exif(image, data, folder=None):
+def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
     """EXIF tags, of the photo or of a folder in them; none where they are damaged: nobody obeys these."""
     if any(mark in data for mark in EXIF_MARKS):
         with warnings.catch_warnings(), contextlib.suppress(Exception):
@@ -210,7 +210,7 @@ def resized(
     return np.clip(found, image.min(), image.max(), order="C").reshape(height, width, *rest)
 
 
-def _axis_weights(old, new):
+def _axis_weights(old: int, new: int) -> Any:
     """(new, old) sparse: what each pixel of an axis takes from those it had."""
     from scipy.sparse import csr_array
 
@@ -247,11 +247,11 @@ def is_heic(path: str | Path) -> bool:
         return _begins_heic(file.read(12))
 
 
-def _begins_heic(data):
+def _begins_heic(data: bytes) -> bool:
     return data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS
 
 
-def _heic_formats():
+def _heic_formats() -> tuple[str, ...]:
     """Formats for Pillow, which knows this one from now on. Raises: Refused without the extra."""
     try:
         importlib.import_module("pi_heif").register_heif_opener()
@@ -296,7 +296,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
         return image.size
 
 
-def _read_pixels(path):
+def _read_pixels(path: str | Path) -> Float[np.ndarray, "h w c"]:
     """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
     with open_image(path) as (image, data):
         if data[:8] == PNG_SIGNATURE:

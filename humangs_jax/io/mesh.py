@@ -103,14 +103,14 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
     return array
 
 
-def _index(value):
+def _index(value: Any) -> int:
     """An index as JSON should have it: Python would count negative ones from the end."""
     if type(value) is not int or value < 0:
         raise Refused(f"{shown(value)} is no index")
     return value
 
 
-def _width(accessor):
+def _width(accessor: dict[str, Any]) -> int:
     return COLUMNS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
 
 
@@ -227,7 +227,7 @@ _FACES = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
 _GROUPS = re.compile(r"^(?:usemtl|o|g|s)\b.*\n?", re.MULTILINE)
 
 
-def _grouped(text, materials):
+def _grouped(text: str, materials: bool) -> str:
     """An OBJ file with the faces of each material together, at its end. Without materials, and for objects and groups, all faces
     are one: trimesh takes longer than linear for each change, even for one that it finds in a comment.
     """
@@ -245,7 +245,7 @@ def _grouped(text, materials):
     return "\n".join([plain(others), *faces])
 
 
-def _folder_of(path):
+def _folder_of(path: Path) -> Any:
     """What trimesh asks for the files that a mesh names: materials and textures beside it."""
     from trimesh.resolvers import Resolver
 
@@ -300,7 +300,7 @@ GREY = 153
 """Of 255: vertices whose color is not known."""
 
 
-def _paint(mesh):
+def _paint(mesh: Any) -> None:
     """Give a mesh colors of its vertices in place of a texture."""
     from trimesh.visual import ColorVisuals
 
@@ -311,7 +311,7 @@ def _paint(mesh):
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1])))
 
 
-def _texture(mesh):
+def _texture(mesh: Any) -> Any:
     """As a PIL.Image that may not be decoded yet, None if it has none."""
     material = getattr(mesh.visual, "material", None)
     image = getattr(material, "baseColorTexture", None)
@@ -337,7 +337,7 @@ def _check_glb(data: bytes, textures: bool) -> None:
                 raise Refused("a texture within the text: expected it as a part of the numbers")
 
 
-def _corners(part, counts):
+def _corners(part: dict[str, Any], counts: list[int]) -> int:
     """Corners of a part of a mesh."""
     indices = 3 * counts[part["indices"]] if "indices" in part else 0
     return indices + counts[part["attributes"]["POSITION"]]

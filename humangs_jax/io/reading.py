@@ -108,7 +108,7 @@ def set_limits(new: Limits | None) -> None:
     _current = new
 
 
-def _limits_of_text(text):
+def _limits_of_text(text: str) -> Limits:
     changes: dict[str, Any] = {}
     kinds: dict[str, Any] = {field.name: type(field.default) for field in dataclasses.fields(Limits)}
     for part in filter(None, (part.strip() for part in text.split(","))):
@@ -192,7 +192,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
         raise raises("" if named else path, "", str(error) if named else _why(kind, error)) from error
 
 
-def _why(kind, error):
+def _why(kind: str, error: Exception) -> str:
     if isinstance(error, MemoryError):
         reason = "out of memory"
     elif isinstance(error, RecursionError):
@@ -341,7 +341,7 @@ def check_nesting(value: Any) -> None:
     raise Refused(f"not usable: nested too deeply, the limit nesting is {limits().nesting} (docs/security.md)")
 
 
-def _containers(value):
+def _containers(value: Any) -> list[Any]:
     values = value.values() if isinstance(value, dict) else value
     return [item for item in values if isinstance(item, list | dict)]
 
