@@ -1,4 +1,4 @@
-"""`humangs import` and `humangs synth`: capture folders from calibrated photos, and of synthetic people."""
+"""`humangs detect`, `import`, `synth`: who is in photos; capture folders from calibrated photos, and of synthetic people."""
 
 import dataclasses
 from pathlib import Path

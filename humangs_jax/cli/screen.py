@@ -1,4 +1,4 @@
-"""What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next.
+"""What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next. Ctrl-C.
 
 Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`.
 Results go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what libraries log as well.

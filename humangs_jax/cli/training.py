@@ -1,4 +1,4 @@
-"""`humangs train` and `humangs convert`: weights of one's own, and the authors'."""
+"""`humangs preprocess`, `train`, `convert`: data sets as training reads them, weights of one's own, and the authors'."""
 
 import dataclasses
 import re

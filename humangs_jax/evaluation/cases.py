@@ -1,4 +1,4 @@
-"""Who is compared with what: people from capture folders, captures or a `Source`, and the methods that predict their views."""
+"""Who is compared with what: people from captures or a `Source`, and the methods that predict their views, the simplest last."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""One evaluator: people from any source, any method, any protocol -> scores of every image, tables and a page."""
+"""One evaluator: people from any source, any method, any protocol -> scores of every image, tables, and a page whose code lies in report/."""
 
 import base64
 import dataclasses

@@ -214,6 +214,7 @@ def stand_ins(variant):
         "avatar.frames.motion_views": lambda *_: (None, None),
         "avatar.frames.turntable_views": lambda _avatar, _pose, views, _shot: ([None] * views, some_cameras(views)),
         "avatar.layers.draw": lambda _, poses, *__: iter(some_renderings(variant, len(poses))),
+        "detection.blazepose.available": lambda: False,
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: ((), (SimpleNamespace(problem=None, inside=1.0),) * capture.view_count),
         "apps.check._posed_frames": lambda capture: {0: np.zeros((4, 3))},
