@@ -1,4 +1,4 @@
-"""One evaluator: people from any source, any method, any protocol -> scores of every image, tables, and a page whose code lies in report/."""
+"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and the page whose code is in report/."""
 
 import base64
 import dataclasses

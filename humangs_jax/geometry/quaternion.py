@@ -147,8 +147,8 @@ def interpolate(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float
     return to_axis_angle(multiply(start, from_axis_angle(share[..., None] * turn)))
 
 
-# Singular vectors: LAPACK decomposes small matrices one by one; this runs on planes of the whole batch, on any backend. Working on the
-# matrix itself, never on its Gram matrix, keeps small singular values accurate (Demmel & Veselić 1992,
+# Singular vectors: LAPACK decomposes small matrices one by one; this runs on planes of the whole batch, on any backend. Working
+# on the matrix itself, never on its Gram matrix, keeps small singular values accurate (Demmel & Veselić 1992,
 # https://doi.org/10.1137/0613074).
 
 SWEEPS = 6
