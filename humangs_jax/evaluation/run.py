@@ -1,4 +1,4 @@
-"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and the page whose code is in report/."""
+"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and the page (report/)."""
 
 import base64
 import dataclasses
