@@ -131,11 +131,7 @@ PRESETS: Presets[Settings] = Presets(
 
 @checked_arguments
 def reconstruct_with(
-    settings: Settings | str,
-    variables: Variables,
-    config: HumanGSConfig,
-    capture: Capture,
-    progress: bool = False,
+    settings: Settings | str, variables: Variables, config: HumanGSConfig, capture: Capture, progress: bool = False
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
 
