@@ -174,13 +174,23 @@ def configuration(cls: type[T]) -> type[T]:
             check_range(type(self), name, getattr(self, name), f"{type(self).__name__}.{name}")
         if own is not None:
             own(self)
+        if isinstance(self, Part):
+            object.__setattr__(self, _MADE, True)
 
     setattr(cls, "__post_init__", __post_init__)  # noqa: B010 (a class of any kind)
     return cls if issubclass(cls, Part) else dataclasses.dataclass(frozen=True)(cls)
 
 
 class Part:
-    """Base of what a field may hold by its registered name: modules of Linen, which are frozen dataclasses already."""
+    """Base of what a field may hold by its registered name: modules of Linen, whose fields are made frozen here."""
+
+    def __setattr__(self, name: str, val: Any) -> None:  # the names of Linen's
+        if _MADE in self.__dict__ and name in field_names(type(self)):
+            raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+        super().__setattr__(name, val)
+
+
+_MADE = "_made"
 
 
 PLACE = ("parent", "name")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from network_cases import TINY, random_inputs
 
-from humangs_jax.core.configuration import Width, config_from_json, config_to_json, part, vary
+from humangs_jax.core.configuration import Width, config_from_json, config_to_json, field_names, part, vary
 from humangs_jax.network.config import Architecture, paper_parts
 from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, intermediates, read
 from humangs_jax.network.parts import Decoder, Encoder, Encoding, HumanGSInputs, Pass, Reader, VertexFeatures
@@ -97,6 +97,9 @@ def test_fields_of_parts_are_checked(make, message):
 def test_parts_are_compared_by_their_configuration():
     assert LookingReader(width=4) == vary(CONFIG, {"architecture.reader.width": 4}).architecture.reader
     assert LookingReader(width=4) != LookingReader() and len({LookingReader(), LookingReader(width=8)}) == 1
+    for made in (LookingReader(), TINY.architecture.decoder):
+        with pytest.raises(dataclasses.FrozenInstanceError, match="cannot assign to field"):
+            setattr(made, next(iter(field_names(type(made)))), 4)
 
 
 @pytest.mark.slow
