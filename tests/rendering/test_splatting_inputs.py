@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from splat_scenes import camera, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import stack_cameras
-from humangs_jax.rendering.splatting import SplatConfig, render, render_views
+from humangs_jax.rendering.splatting import SplatConfig, render, render_views, round_up
 
 CONFIG = SplatConfig(max_pairs=1 << 12)
 BATCH = stack_cameras([camera(np.float32)] * 3)
@@ -85,3 +87,13 @@ def test_inside_transformations_wrong_values_stay_what_they_are():
     wrong = replace(gaussians, colors=gaussians.colors.at[0].set(np.nan))
     draw = jax.jit(lambda g: render(g, camera(np.float32), CONFIG).rgb)
     assert np.isnan(draw(wrong)).any() and np.isfinite(draw(gaussians)).all()
+
+
+@given(st.integers(0, 10**9))
+def test_capacities_are_few_sufficient_and_not_wasteful(size):
+    capacity = round_up(size)
+    assert capacity >= max(size, 64) and (size <= 64 or 4 * capacity <= 5 * size + 4)
+    while capacity % 2 == 0:
+        capacity //= 2
+    assert capacity in (1, 3, 5, 7)
+    assert round_up(size) <= round_up(size + 1)
