@@ -2,17 +2,17 @@
 
 A rasterizer uses it in five steps, all with static shapes and none of them differentiated:
 
-1. count, for every item, how many tiles it touches, and `expand` the counts: slot -> item (in one step, or item -> rows of
-tiles -> tiles, as `emit_pairs` does). From the slot's place among the item's slots follows its tile; slots that are not needed
-get tile `grid.tiles`. 2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item number inside a tile. Number the items
-by depth first (`depth_order`) and every list runs front to back. 3. `blocks_by_length`: tiles by falling list length, so that
-a block of consecutive ones has lists of about the same length, and empty tiles come last and are never visited. 4. the
-rasterizer's own loop over blocks, and over chunks of the lists of a block; pixels of a tile are one axis of `tile_size`^2
-values, row by row, at `grid.offsets` from the tile's centre in `grid.centers`. 5. `tiles_to_image`, and `image_to_tiles` for
-gradients.
+1. `expand` the counts of the tiles that each item touches: slot -> item (or item -> rows of tiles -> tiles: `emit_pairs`).
+2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item inside a tile. Number the items by depth first (`depth_order`)
+   and every list runs front to back.
+3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists of about the same length, and
+   empty tiles come last and are never visited.
+4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of `tile_size`^2 values, row by row, at
+   `grid.offsets` from the tile's centre in `grid.centers`.
+5. `tiles_to_image`, and `image_to_tiles` for gradients.
 
-What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Image sizes need not be
-multiples of the tile size: the last row and column of tiles reach beyond the image, and those pixels are cut off.
+What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where the last row and column of
+tiles reach beyond the image, those pixels are cut off.
 
 A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha < alpha_min. It meets a
 tile if it meets the rectangle spanned by the tile's pixel centres. With D the determinant of cov2d, the ellipse at height dy
