@@ -73,10 +73,10 @@ class RefineConfig:
     poses: bool = False
     """Also refine the body pose of each photo. The corrected poses are not returned."""
     held_out: Share = 0.05
-    """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no iteration and no step
-    sees: the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out
-    of a trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are kept; then all
-    photos are fitted. 0: nothing is held out, and the last state is returned."""
+    """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no iteration and no
+    step sees: the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole
+    photo out of a trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are
+    kept; then all photos are fitted. 0: nothing is held out, and the last state is returned."""
     checks: Few = 5
     """How often the PSNR is measured."""
     seed: Seed = 0
