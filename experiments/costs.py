@@ -41,11 +41,7 @@ class Costs:
         """That often."""
         often = lambda counter: Counter({key: count * number for key, number in counter.items()})
         return Costs(
-            count * self.dots,
-            count * self.convolutions,
-            self.unknown_trips,
-            often(self.messages),
-            often(self.sent),
+            count * self.dots, count * self.convolutions, self.unknown_trips, often(self.messages), often(self.sent)
         )
 
 

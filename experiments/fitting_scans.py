@@ -2,7 +2,6 @@
 
 import functools
 import time
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -19,11 +18,8 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
 from humangs_jax.fitting.scan_reading import sample_scan
 from humangs_jax.fitting.similarity import Similarity
-from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.io.images import write_png
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import make_subject, seeds_of
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 POSE_STREAM, JOINT_STREAM, PLACE_STREAM = 31, 33, 34
 PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -43,7 +39,6 @@ def fit_scans(
     kinds: tuple[Literal["bare", "clothed"], ...] = ("bare", "clothed"),
     noise_mm: float = 5.0,
     without_joints: bool = False,
-    images: Path | None = None,
 ) -> None:
     """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any.
 
@@ -57,7 +52,6 @@ def fit_scans(
     first: first person of the split
     noise_mm: standard deviation of the given 17 joints of COCO in each direction
     without_joints: search for the pose (name the table fit_scans_without_joints)
-    images: scans with the fitted body, worst and best people
     """
     if subjects < 1:
         raise ValueError("--subjects: expected at least 1")
@@ -68,10 +62,7 @@ def fit_scans(
         for kind in kinds
     }
     settings = {"split": split, "noise_mm": noise_mm, "joints": not without_joints}
-    rows = run.rows(cases, settings, again=bool(images))
-    if images:
-        drawn = [(rows[name]["surface_mm"], name.split()[0], run.pictures[name]) for name in rows]
-        draw_extremes(images, drawn, kinds)
+    rows = run.rows(cases, settings)
     numbers: dict[str, Any] = {
         kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds
     }
@@ -102,7 +93,7 @@ def scans_table(numbers: dict[str, Any], noise_mm: float, without_joints: bool) 
 
 
 def fit_one(seed, kind, body, noise_mm, without_joints):
-    """Scores of one scan, and what a picture of it needs."""
+    """Scores of one scan."""
     true, landmarks, vertices, faces = person(seed, kind, body)
     place, rng = random_place(seed), np.random.default_rng([seed, JOINT_STREAM])
     noisy = place(landmarks + rng.normal(0, noise_mm / 1000, landmarks.shape))
@@ -117,7 +108,7 @@ def fit_one(seed, kind, body, noise_mm, without_joints):
     row = {"seed": seed, "kind": kind, "vertex_mm": float(vertex.mean()), "surface_mm": float(surface.mean())}
     row |= {"surface_p95_mm": float(np.quantile(surface, 0.95)), "seconds": seconds}
     row |= {"scale_ratio": fit.world_from_scan.scale * place.scale, "converged": bool(fit.report.stages[-1].converged)}
-    return row, (f"{kind} {seed}: {row['surface_mm']:.1f} mm", vertices, jnp.asarray(faces), fitted, body.faces)
+    return row
 
 
 def person(seed, kind, body):
@@ -178,44 +169,3 @@ def summary(rows):
         "mean_surface_mm_of_successes": float(np.mean([row["surface_mm"] for row in good])) if good else None,
         "seconds_per_scan": float(np.median([row["seconds"] for row in rows])),
     }
-
-
-def draw_extremes(path, drawn, kinds):
-    """Best and worst scan of each kind: from two sides, the scan grey, the fitted body over it in red."""
-    rows = []
-    for kind in kinds:
-        of_kind = sorted((each for each in drawn if each[1] == kind), key=lambda each: each[0])
-        for _, _, (title, *picture) in (of_kind[0], of_kind[-1]):
-            print("drawn:", title)
-            rows.append(draw_overlay(*picture))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.concatenate(rows, axis=0))
-
-
-def draw_overlay(vertices, faces, fitted, body_faces, size=420):
-    """(size, 6 size, 3): from three sides, the scan, and beside it the body with the scan as a veil over it."""
-    middle = jnp.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2, jnp.float32)
-    distance = 2.2 * float(np.ptp(vertices, axis=0).max())
-    K = intrinsics_from_fov(0.5, size, size)
-    cameras = orbit(middle, distance, jnp.asarray([0.0, 1.57, 3.14]), 0.1, K, size, size)
-    parts = []
-    for view in range(3):
-        scan, body = (shaded(v, f, cameras[view]) for v, f in ((vertices, faces), (fitted, body_faces)))
-        red = body[0][..., None] * np.asarray([1.0, 0.45, 0.4])
-        red = np.where(body[1][..., None], red, 1.0)
-        veil = np.where(scan[1][..., None], 0.35 * scan[0][..., None] + 0.65 * red, red)
-        parts += [np.where(scan[1][..., None], scan[0][..., None], 1.0) * np.ones(3), veil]
-    return np.concatenate(parts, axis=1)
-
-
-def shaded(vertices, faces, camera):
-    """Brightness (h, w) and where there is something (h, w)."""
-    faces = np.asarray(faces)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    found = np.asarray(
-        rasterize_mesh(jnp.asarray(vertices, jnp.float32), jnp.asarray(faces, jnp.int32), camera).face_ids
-    )
-    facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
-    return np.where(found >= 0, 0.3 + 0.7 * facing[np.maximum(found, 0)], 1.0), found >= 0

@@ -14,8 +14,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.geometry.camera import intrinsics_from_fov, look_at, orbit
-from humangs_jax.io.images import write_png
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.people import anatomy as poses
 from humangs_jax.people.anatomy import LIMITS, Build, Rotations
 from humangs_jax.people.poses import sample_rotations
@@ -24,7 +23,6 @@ from humangs_jax.people.sequences import KINDS, sample_sequence
 from humangs_jax.people.subject import DEMO, make_subject
 from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 OUTSIDE = 2e-3
 """Metres along the normal at which a vertex asks."""
@@ -77,8 +75,8 @@ TOUCHING = 4e-3
 
 
 @entry
-def people_poses(run: Run, poses: int = 200, sequences: int = 12, strips: Path | None = None) -> None:
-    """The pose prior and the sequences: self-penetration, soles on the ground, sliding; optionally strips of frames.
+def people_poses(run: Run, poses: int = 200, sequences: int = 12) -> None:
+    """The pose prior and the sequences: self-penetration, soles on the ground, sliding.
 
     80 s of one CPU core. Expect: 0.85 % of the vertices inside another part, nearly all in creases of armpits and groin, 0.11 %
     of them without these parts; planted soles within 6 mm of the ground, which slide by 0.1 mm a frame in walks, less in the
@@ -87,7 +85,6 @@ def people_poses(run: Run, poses: int = 200, sequences: int = 12, strips: Path |
     Options:
     poses: of the prior
     sequences: of 60 frames, of all kinds in turn
-    strips: folder for poses.png and sequences.png
     """
     body = load_body()
     joints = np.asarray(body.joint_regressor @ body.template, float)
@@ -102,9 +99,6 @@ def people_poses(run: Run, poses: int = 200, sequences: int = 12, strips: Path |
         "feet": {kind: sliding(body, [s for s in moved if s.kind == kind]) for kind in dict.fromkeys(kinds)},
     }
     run.show(json.dumps(numbers, indent=1), numbers)
-    if strips:
-        strips.mkdir(parents=True, exist_ok=True)
-        draw_strips(body, drawn, moved, strips)
 
 
 def penetration(meter, poses) -> dict:
@@ -164,37 +158,6 @@ def sliding(body, sequences) -> dict:
         "planted_sole_mm": [1e3 * float(np.min(heights)), 1e3 * float(np.max(heights))],
         "lowest_point_mm": 1e3 * float(lowest_ever),
     }
-
-
-def draw_strips(body, poses, sequences, folder: Path) -> None:
-    """poses.png: 40 of the poses. sequences.png: a row of 12 frames for each sequence. The bare body, grey."""
-    size, rest = 160, shape_body(body, jnp.zeros(0))
-    pose = jax.jit(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices)
-
-    def draw(rotations, translation, azimuth, grounded):
-        vertices = pose(jnp.asarray(rotations, jnp.float32), jnp.asarray(translation, jnp.float32))
-        if grounded:
-            vertices = vertices - jnp.asarray([0, 1.0, 0]) * vertices[:, 1].min()
-        target = jnp.asarray([translation[0], 0.85, translation[2]], jnp.float32)
-        eye = target + jnp.asarray([2.7 * np.sin(azimuth), 0.3, 2.7 * np.cos(azimuth)], jnp.float32)
-        camera = look_at(eye, target, jnp.asarray([0.0, 1.0, 0.0]), intrinsics_from_fov(0.75, size, size), size, size)
-        light = jnp.asarray([0.3, 0.8, 0.5]) / jnp.linalg.norm(jnp.asarray([0.3, 0.8, 0.5]))
-        bright = 0.35 + 0.6 * jnp.clip(vertex_normals(vertices, body.faces) @ light, 0, 1)
-        grey = jnp.repeat(bright[:, None], 3, axis=1)
-        return np.asarray(
-            interpolate_attributes(rasterize_mesh(vertices, body.faces, camera), body.faces, grey, jnp.ones(3))
-        )
-
-    pictures = [draw(r, np.zeros(3), 0.6 if i % 2 else -0.5, True) for i, r in enumerate(poses[:40])]
-    rows = [np.concatenate(pictures[i : i + 10], 1) for i in range(0, len(pictures) // 10 * 10, 10)]
-    if rows:
-        write_png(folder / "poses.png", np.concatenate(rows))
-    strips = []
-    for s in sequences[:8]:
-        shown = np.linspace(0, len(s.rotations) - 1, 12).astype(int)
-        strips.append(np.concatenate([draw(s.rotations[i], s.translations[i], 0.9, False) for i in shown], 1))
-    if strips:
-        write_png(folder / "sequences.png", np.concatenate(strips))
 
 
 FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)

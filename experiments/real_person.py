@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from experiments.harness import Run, entry
-from experiments.real_cameras import camera_errors, reference_cameras, seen_from, to_reference
 from experiments.real_capture import (
     FRAMES,
     PACKAGE,
@@ -27,10 +26,14 @@ from experiments.real_capture import (
 )
 from experiments.real_people import (
     as_fitted,
+    camera_errors,
     draw_sheet,
     one_view_each,
     person_in_rooms,
+    reference_cameras,
+    seen_from,
     started,
+    to_reference,
     video_sizes,
     without_calibration,
 )

@@ -96,9 +96,14 @@ def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
 
 
 def pages(repository: Path | None = None) -> list[Path]:
-    """README.md and all pages of the docs."""
+    """README.md, all pages of the docs, and that of the experiments."""
     repository = repository or REPOSITORY
-    return [repository / "README.md", *sorted((repository / "docs").rglob("*.md"))]
+    found = [
+        repository / "README.md",
+        repository / "experiments" / "README.md",
+        *sorted((repository / "docs").rglob("*.md")),
+    ]
+    return [page for page in found if page.is_file()]
 
 
 def page_of(name: str) -> Path:
@@ -109,7 +114,7 @@ def page_of(name: str) -> Path:
     found = [page for page in pages() for match in SECTION.finditer(page.read_text()) if match["name"] == name]
     if len(found) != 1:
         raise ValueError(
-            f"needs <!-- table: {name} --> and <!-- end --> once in README.md or docs/, found {len(found)}"
+            f"needs <!-- table: {name} --> and <!-- end --> once in README.md, experiments/README.md or docs/, found {len(found)}"
         )
     return found[0]
 

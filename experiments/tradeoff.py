@@ -34,7 +34,7 @@ from experiments.subjects import (
     shipped_digest,
 )
 from experiments.timing import timed
-from experiments.tradeoff_points import DEFAULT, points
+from experiments.tradeoff_report import DEFAULT, points
 from humangs_jax.apps.settings import reconstruct_with
 from humangs_jax.avatar.frames import capture_views, draw, splatting_of, without_unseen
 from humangs_jax.avatar.reconstruct import reconstruct_batch
@@ -331,11 +331,7 @@ class Bench:
         own, default = np.median(pairs, axis=0)
         with peak_memory() as peak:
             avatar = make()
-        return {
-            "reconstruct": float(own / default),
-            "memory_mb": peak[0],
-            "gaussians": len(avatar.gaussians.means),
-        }
+        return {"reconstruct": float(own / default), "memory_mb": peak[0], "gaussians": len(avatar.gaussians.means)}
 
     def growth(self) -> dict[str, Any]:
         """People in a batch over one person, and a large frame with the person in a small box over a frame of the box."""

@@ -12,6 +12,7 @@ On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine.
 humangs_jax/assets/weights.md.
 """
 
+import logging
 import os
 import signal
 import sys
@@ -19,14 +20,27 @@ import threading
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
+import numpy as np
 import tyro
 
+from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import keep_freed_memory
+from humangs_jax.data.loading import find_captures
+from humangs_jax.network.config import HumanGSConfig, paper_parts
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.parts import Variables
+from humangs_jax.network.weights import expected_variables, flatten_variables, load_weights, save_weights
+from humangs_jax.people.bank import load_bank
+from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.config import TrainConfig, small
+from humangs_jax.training.loop import TrainingInterrupted, train
+from humangs_jax.training.sources import on_the_fly_people, training_people
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 VALIDATION_SUBJECTS = 8
+HEADS = "params/decoder/"
 
 
 def main(
@@ -57,20 +71,6 @@ def main(
     """
     if not 0 <= start_share < 1 or (start_share and init_weights is None):
         raise ValueError(f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is not 0")
-    import logging
-
-    import jax
-    import numpy as np
-
-    from experiments.grow import fit_variables
-    from humangs_jax.body.library import load_body
-    from humangs_jax.data.loading import find_captures
-    from humangs_jax.network.weights import load_weights
-    from humangs_jax.people.bank import load_bank
-    from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.training.loop import TrainingInterrupted, train
-    from humangs_jax.training.sources import on_the_fly_people, training_people
-
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     if hours is not None:
         timer = threading.Timer(3600 * hours, os.kill, (os.getpid(), signal.SIGTERM))
@@ -96,13 +96,56 @@ def main(
 
 def write_mean(out: Path, start: Any, share: float) -> None:
     """Writes out/mean.safetensors from the first weights and out/weights.safetensors."""
-    import jax
-
-    from humangs_jax.network.weights import load_weights, save_weights
-
     trained, model = load_weights(out / "weights.safetensors")
     mean = jax.tree.map(lambda first, last: share * first + (1 - share) * last, start, trained)
     save_weights(out / "mean.safetensors", mean, model, "float16")
+
+
+def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:
+    """Variables of the network `old` for the network `new`, to train on.
+
+    Both have the paper's reader and decoder. `new` may have shells where `old` has none, another number of free Gaussians and
+    other settings without tensors. New tensors start as initialised, and with zero weight where they enter a layer. With
+    another `decoder.frame` offsets and rotations are initialised again, because their axes differ.
+
+    Raises: ValueError naming the setting or the tensor if more differs.
+    """
+    (_, old_reader, old_decoder), (_, new_reader, new_decoder) = map(paper_parts, (old.architecture, new.architecture))
+    for name, was, wanted in (  # either shifts what tensors hold
+        ("reader.sample_rgb", old_reader.sample_rgb, new_reader.sample_rgb),
+        ("decoder.tight", old_decoder.tight, new_decoder.tight),
+    ):
+        if was != wanted:
+            raise ValueError(f"{name} {was}: that of trained weights cannot become {wanted}")
+    if old_reader.shells not in ((), new_reader.shells):
+        raise ValueError(f"shells {old_reader.shells}: those of trained weights cannot become {new_reader.shells}")
+    ours, wanted = flatten_variables(variables), flatten_variables(expected_variables(new))
+    anew = {key for key in wanted if key.startswith(f"{HEADS}shells_")} - set(ours)
+    if unknown := sorted((set(ours) - set(wanted)) | (set(wanted) - set(ours) - anew)):
+        raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
+    if old_decoder.frame != new_decoder.frame:
+        anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
+
+    differ = {key for key in set(ours) - anew if ours[key].shape != wanted[key].shape}
+    heads = {key for key in differ if key.startswith(HEADS) and key.split("/")[-2].endswith("_out")}
+    trunk = {key for key in differ if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(wanted[key])}
+    if wrong := sorted(differ - heads - trunk):
+        was, now = ours[wrong[0]].shape, wanted[wrong[0]].shape
+        raise ValueError(f"tensor {wrong[0]!r} has shape {was}, the other network wants {now}")
+    if not (anew | differ):
+        return variables
+
+    def fit(key, leaf):
+        if key in trunk:  # shells and normals enter last
+            return leaf.at[len(ours[key]) :].set(0).at[: len(ours[key])].set(ours[key])
+        if key in heads:  # Gaussians come one after the other
+            both = min(leaf.shape[-1], ours[key].shape[-1])
+            return leaf.at[..., :both].set(ours[key][..., :both])
+        return leaf if key in anew else ours[key]
+
+    fresh = flatten_variables(init_humangs(jax.random.key(0), new))  # compiles for a while: only where it is needed
+    structure = jax.tree.structure(expected_variables(new))
+    return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
 
 
 if __name__ == "__main__":

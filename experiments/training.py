@@ -188,15 +188,7 @@ def first(batch: Any) -> Any:
 
 def steps_table(result: dict[str, Any]) -> str:
     """One line per case. The share is of CPU time on a CPU, which others use, too, and of wall time elsewhere."""
-    header = [
-        "one subject a step",
-        "tokens",
-        "Gaussians",
-        "wall, CPU s",
-        "samples/s",
-        "TFLOP",
-        "share of floor",
-    ]
+    header = ["one subject a step", "tokens", "Gaussians", "wall, CPU s", "samples/s", "TFLOP", "share of floor"]
     header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
     rows = [
         [

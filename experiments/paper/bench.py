@@ -198,10 +198,7 @@ def train_variant(
         state = train(config, body, people, out, progress=False)
     except TrainingInterrupted as stopped:
         state = stopped.state
-    spent = {
-        "cpu": before["cpu"] + time.process_time() - cpu,
-        "wall": before["wall"] + time.perf_counter() - wall,
-    }
+    spent = {"cpu": before["cpu"] + time.process_time() - cpu, "wall": before["wall"] + time.perf_counter() - wall}
     write_json(clock, spent)
     if int(state.step) < config.steps:
         return None

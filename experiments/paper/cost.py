@@ -38,12 +38,7 @@ POINTS, TOKENS = 40000, 4096 + 1024
 
 @entry
 def paper_cost(
-    run: Run,
-    width: int = 128,
-    repeats: int = 3,
-    networks: bool = False,
-    quick: bool = False,
-    image: Path | None = None,
+    run: Run, width: int = 128, repeats: int = 3, networks: bool = False, quick: bool = False, image: Path | None = None
 ) -> None:
     """The paper's central claim: vertices that are projected into the photos against vertices that attend to all tokens.
 
@@ -114,10 +109,7 @@ def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> d
         traced = jax.jit(read).trace(variables, encoding, inputs)
         program = traced.lower().compile()
         sums = READ_OPERATIONS * views * vertices * width if name == "back-projection" else 0
-        found[name] = {
-            "operations": costs_of(traced).flops + sums,
-            "temporary_mb": temporary_mb(program),
-        }
+        found[name] = {"operations": costs_of(traced).flops + sums, "temporary_mb": temporary_mb(program)}
         runs[name] = lambda p=program, v=variables: jax.block_until_ready(p(v, encoding, inputs))
     for name, (wall, cpu) in medians(runs, repeats).items():
         found[name] |= {"ms": float(wall), "cpu_ms": float(cpu)}
@@ -225,10 +217,7 @@ def text_of(result: dict[str, Any]) -> str:
                 significant(dear["temporary_mb"]),
             ]
         )
-    texts = [
-        f"Readers of width {result['width']}.",
-        markdown_table(header, rows, "r" * len(header)),
-    ]
+    texts = [f"Readers of width {result['width']}.", markdown_table(header, rows, "r" * len(header))]
     if networks := result["networks"]:
         ours = networks["humangs"]["operations"]
         lines = [

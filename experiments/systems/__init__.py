@@ -133,10 +133,7 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
-        reader, decoder = (
-            TwoStreamReader(pooling=pooling, most_views=most_views),
-            VertexDecoder(hidden=512),
-        )
+        reader, decoder = (TwoStreamReader(pooling=pooling, most_views=most_views), VertexDecoder(hidden=512))
         conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.01)
     else:
         encoder = _photo_encoder(dataclasses.replace(BENCH_TRANSFORMER, class_token=False))

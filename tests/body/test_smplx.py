@@ -11,7 +11,7 @@ import pytest
 import scipy.sparse
 
 from experiments.harness import call
-from experiments.paper import release
+from experiments.paper import baselines as release
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression

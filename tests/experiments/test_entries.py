@@ -11,10 +11,10 @@ PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
 CASES = {
     "evaluation_view_selection": "--subjects 1",
     "extremes": "--cases black",
-    "fit_end_to_end": "--people 1 --seconds 0.5 --images FOLDER",
+    "fit_end_to_end": "--people 1 --seconds 0.5",
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
     "fit_refinement": "--subjects 1 --views 2 --size 64 --images FOLDER --cases bare",
-    "fit_scans": "--subjects 1 --kinds bare --images FOLDER/a.png",
+    "fit_scans": "--subjects 1 --kinds bare",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
     "light": PEOPLE,
     "loss_gradients": "--quick",

@@ -4,7 +4,7 @@ import json
 
 from experiments import tradeoff_report as report
 from experiments.results import REPOSITORY
-from experiments.tradeoff_points import points
+from experiments.tradeoff_report import points
 
 
 def row(name, reconstruct, frame, psnr, start="network", steps=0):

@@ -9,7 +9,7 @@ import pytest
 from network_cases import TINY, random_inputs, random_variables
 from safetensors.numpy import load_file, save_file
 
-from experiments.grow import fit_variables
+from experiments.train_shipped import fit_variables
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.network import presets, weights
 from humangs_jax.network.config import paper_parts

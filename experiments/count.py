@@ -1,0 +1,157 @@
+"""The size and shape of the project, counted from its files."""
+
+import ast
+import subprocess
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from experiments.harness import Run, entry
+from experiments.results import REPOSITORY, markdown_table
+
+PACKAGE = "humangs_jax"
+LONG = 500
+"""Lines from which on a module is long."""
+
+
+@entry
+def count(run: Run, before: Path | None = None, details: bool = False) -> None:
+    """Lines, modules, words, annotations, importers and circles of imports of package, tests, experiments and docs.
+
+    Only files that git knows. "Annotated": all arguments and the result; functions in functions, lambdas and __methods__ do not
+    count. "One importer": modules that a single other module imports, also inside of functions; tables of names are not read.
+
+    Options:
+    before: another checkout of the project, whose numbers stand beside these
+    details: names of long modules, of those with one importer, and of circles
+    """
+    columns = {"before": measure(before)} if before else {}
+    columns["now"] = measure(REPOSITORY)
+    if details:
+        for name, value in columns["now"].items():
+            if isinstance(value, list):
+                print(f"{name}: {', '.join(map(str, value)) or 'none'}")
+    shown = lambda value: (
+        f"{len(value) if isinstance(value, list) else value:,}" if not isinstance(value, str) else value
+    )
+    rows = [[name, *(shown(column.get(name, "")) for column in columns.values())] for name in columns["now"]]
+    numbers = {
+        title: {name: len(value) if isinstance(value, list) else value for name, value in column.items()}
+        for title, column in columns.items()
+    }
+    run.show(markdown_table(["", *columns], rows), numbers, "size")
+
+
+def measure(root: Path) -> dict[str, Any]:
+    """Numbers, shares as text, and lists of names."""
+    files = subprocess.run(
+        ["git", "ls-files"], cwd=root, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    known = [name for name in files if (root / name).is_file()]
+    python = {name: (root / name).read_text() for name in known if name.endswith(".py")}
+    of = lambda *folders: {name: text for name, text in python.items() if name.startswith(folders)}
+    lines = lambda texts: sum(text.count("\n") for text in texts.values())
+    package, found = of(f"{PACKAGE}/"), {}
+    parts = {"package": package, "tests": of("tests/"), "experiments": of("experiments/")}
+    for name, texts in parts.items():
+        found |= {f"{name}: lines": lines(texts), f"{name}: modules": sum(1 for text in texts.values() if text.strip())}
+    for folder in sorted({name.split("/")[1] for name in parts["experiments"] if name.count("/") > 1}):
+        found[f"experiments/{folder}: lines"] = lines(of(f"experiments/{folder}/"))
+    pages = [name for name in known if name == "README.md" or (name.startswith("docs/") and name.endswith(".md"))]
+    found |= {"docs: pages": len(pages), "docs: words": sum(len((root / name).read_text().split()) for name in pages)}
+    results = [name for name in known if name.startswith("docs/results/")]
+    found["docs/results: lines"] = sum((root / name).read_text().count("\n") for name in results)
+    for kind, private in (("public", False), ("private", True)):
+        each = [annotated(node) for node, hidden in functions(package.values()) if hidden == private]
+        found[f"{kind} functions annotated"] = f"{sum(each):,} of {len(each):,}, {sum(each) / max(1, len(each)):.0%}"
+    found[f"modules above {LONG} lines"] = [name for name, text in package.items() if text.count("\n") > LONG]
+    always, anywhere = imports(package, True), imports(package, False)
+    importers: dict[str, set[str]] = {}
+    for module, targets in anywhere.items():
+        for target in targets - {module}:
+            importers.setdefault(target, set()).add(module)
+    found["modules with one importer"] = [
+        f"{name} ({next(iter(by))})" for name, by in sorted(importers.items()) if len(by) == 1 and name != PACKAGE
+    ]
+    found["public names"] = len(public_names(root))
+    found["circles of imports"] = circles(always)
+    found["circles with imports inside of functions"] = circles(anywhere)
+    return found
+
+
+def functions(texts: Iterable[str]) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
+    """Functions and methods of modules, and whether one is private."""
+
+    def inside(body, hidden):
+        for node in body:
+            if isinstance(node, ast.ClassDef):
+                yield from inside(node.body, hidden or node.name.startswith("_"))
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("__"):
+                yield node, hidden or node.name.startswith("_")
+
+    for text in texts:
+        yield from inside(ast.parse(text).body, False)
+
+
+def annotated(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """All arguments but self and cls, and the result."""
+    given = function.args
+    named = [*given.posonlyargs, *given.args, *given.kwonlyargs, *filter(None, (given.vararg, given.kwarg))]
+    typed = all(each.annotation for each in named if each.arg not in ("self", "cls"))
+    return typed and function.returns is not None
+
+
+def imports(package: dict[str, str], at_import: bool) -> dict[str, set[str]]:
+    """Module -> modules of the package that it imports. at_import: without those inside of functions and for types alone."""
+    name_of = lambda path: path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    modules = {name_of(path): text for path, text in package.items()}
+
+    def statements(body):
+        for node in body:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                yield node
+            elif at_import and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                yield from statements(node.orelse)
+            elif not (at_import and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)):
+                yield from statements(ast.iter_child_nodes(node))
+
+    found: dict[str, set[str]] = {}
+    for module, text in modules.items():
+        names = []
+        for node in statements(ast.parse(text).body):
+            if isinstance(node, ast.ImportFrom):
+                names += [f"{node.module}.{each.name}" for each in node.names]
+            else:
+                names += [each.name for each in node.names]
+        # a name of a module is an import of that module
+        found[module] = {each if each in modules else each.rpartition(".")[0] for each in names} & set(modules) - {
+            module
+        }
+    return found
+
+
+def circles(graph: dict[str, set[str]]) -> list[str]:
+    """Sets of modules that import each other, by way of others."""
+
+    def reached(start):
+        seen, todo = set(), [start]
+        while todo:
+            for each in graph.get(todo.pop(), ()):
+                if each not in seen:
+                    seen.add(each)
+                    todo.append(each)
+        return seen
+
+    reach = {module: reached(module) for module in graph}
+    found = {
+        frozenset(other for other in reach[module] if module in reach[other])
+        for module in graph
+        if module in reach[module]
+    }
+    return [" <-> ".join(sorted(each)) for each in found]
+
+
+def public_names(root: Path) -> list[str]:
+    """What `import humangs_jax` offers."""
+    tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
+    return [each.asname or each.name for node in tree.body if isinstance(node, ast.ImportFrom) for each in node.names]
