@@ -21,6 +21,8 @@ def count(run: Run, before: Path | None = None, details: bool = False) -> None:
     Only files that git knows. "Annotated": all arguments and the result; functions in functions, lambdas and __methods__ do not
     count. "One importer": modules that a single other module imports, also inside of functions; tables of names are not read.
 
+    Tables: size
+
     Options:
     before: another checkout of the project, whose numbers stand beside these
     details: names of long modules, of those with one importer, and of circles

@@ -4,6 +4,8 @@ An experiment is a function with `@entry`. Its first argument is a `Run`, the ot
 positional, annotations are numbers, paths, flags, `Literal` choices and tuples of these. A dataclass as default stands for its
 fields. Lines `name: text` below `Options:` in a docstring are the help.
 
+Its table has its name, unless a line `Tables: NAMES` of the docstring says otherwise.
+
 Every experiment has --json OUT (rows, numbers, date, machine, versions; finished rows of the same settings are kept) and
 --publish (docs/results/TABLE.json, and the page that shows the table).
 """
@@ -71,8 +73,11 @@ def call(function: FunctionType, options: Sequence[str]) -> int:
     asked = parser.parse_args(options)
     run = Run(function.__name__, asked.table, asked.json, asked.publish, list(options))
     try:
-        if asked.publish:
-            page_of(asked.table)  # before long work
+        if asked.publish:  # before long work
+            named = re.findall(r"^Tables?: ([\w, ]+)", inspect.getdoc(function) or "", re.MULTILINE)
+            own = asked.table == function.__name__ and named
+            for table in named[0].split(", ") if own else [asked.table]:
+                page_of(table)
         return function(run, **{name: make(asked) for name, make in given.items()}) or 0
     except (ValueError, OSError) as error:
         traceback.print_exc()

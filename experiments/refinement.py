@@ -297,6 +297,8 @@ def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
     HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --out b; readme b/report.json --timed a/report.json
     Times are those of an idle machine, from an empty compile cache.
 
+    Tables: readme_quality
+
     Options:
     refined: report of the refined demo
     timed: report of the unrefined demo, nothing compiled before; without it times stay

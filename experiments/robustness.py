@@ -301,7 +301,8 @@ def stability(
     drawn anew for every seed, on the demo person. An error is a relative L2 norm, the largest over the arrays of a stage and over
     the seeds: of what the stage gives, of the gradients that it sends back, and of those of its parameters. float16 runs forward
     only. tf32: float32 with products as the device's matrix units compute them; left out where the device has none.
-    Tables: TABLE_shipped, TABLE_published.
+
+    Tables: stability_shipped, stability_published
 
     Options:
     types: number types to compare

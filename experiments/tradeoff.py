@@ -75,7 +75,7 @@ def tradeoff(
 ) -> None:
     """Speed against accuracy of the whole path: some 70 settings, their front, and presets. 50 minutes on one core.
 
-    Tables: tradeoff, tradeoff_presets, tradeoff_naive, tradeoff_growth.
+    Tables: tradeoff, tradeoff_presets, tradeoff_naive, tradeoff_growth
 
     Options:
     out: JSON of the points; those that are there are not measured again
