@@ -45,35 +45,40 @@ BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 @configuration
 class OnTheFlyConfig:
-    """What an example shows.
-
-    input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
-    mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
-    jitter, scattered_share: see `cameras.azimuths_from`. close_share: share of close cameras among the targets.
-    mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel. depths: also of every view.
-    views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
-    colored at a time: few for CPUs, whole images for accelerators.
-    """
+    """What an example shows."""
 
     input_views: Few = 4
     target_views: Few = 3
     input_size: Side = 256
+    """Pixels a side."""
     target_size: Side = 256
+    """Pixels a side."""
     poses: Few = 2
+    """Per example; targets show any of them."""
     mixed_pose_share: Share = 0.3
+    """Of examples whose inputs show any of the poses too, each; otherwise all show the first."""
     jitter: Spread = 0.7
+    """See `cameras.azimuths_from`."""
     scattered_share: Share = 0.2
+    """See `cameras.azimuths_from`."""
     close_share: Share = 0.2
+    """Of close cameras among the targets."""
     mirrored_share: Share = 0.5
+    """Of examples."""
     dyed_share: Share = 0.7
+    """Of examples."""
     supersampling: Annotated[int, Range(1, 16)] = 2
+    """Samples a side of each pixel."""
     depths: bool = False
+    """Also of every view."""
     views_at_once: Few = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
+    """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
     pixels_per_step: Slots = knob(
         1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
     )
+    """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
 
 
 ON_THE_FLY = OnTheFlyConfig()

@@ -56,23 +56,23 @@ MANIFEST_EVERY = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What is written for each person.
-
-    image_size: pixels a side; smaller sizes are box averages of it (the loader makes them).
-    poses: how many; each is seen by `views` cameras of the published protocol and `close_views` nearer ones.
-    held_out_views: cameras of the same pose, and of each of `novel_poses` others, in held_out/.
-    frames: 0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of `frames` frames, 30 a second.
-    scan_texture: texels a side of the scan's texture, 0: no scan.
-    """
+    """What is written for each person."""
 
     image_size: int = 512
+    """Pixels a side; smaller sizes are box averages of it (the loader makes them)."""
     poses: int = 1
+    """How many."""
     views: int = 60
+    """Cameras of the published protocol that see each pose."""
     close_views: int = 0
+    """Nearer ones."""
     held_out_views: int = 0
+    """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
     novel_poses: int = 0
     frames: int = 0
+    """0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of so many, 30 a second."""
     scan_texture: int = 0
+    """Texels a side of the scan's texture, 0: no scan."""
 
 
 @dataclasses.dataclass(frozen=True)

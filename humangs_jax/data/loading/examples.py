@@ -25,24 +25,23 @@ WINDOW_OF = 60
 
 @configuration
 class ViewSampling:
-    """Which views of a subject are input and which are targets.
-
-    rule: "random": inputs stand around the subject, targets are drawn from all other views, of any pose.
-        "window": the release's. Of a random window in the order of the views, whose ends are 25 to 59 views apart where a
-        subject has 60 (in proportion for other counts), take the two ends, then random views inside; the first of these
-        are input, the last targets. jitter, scattered_share and mixed_pose_share are not used.
-    input_counts: numbers of input views; one is drawn per step (each compiles once). target_count: target views.
-    jitter: inputs stand evenly around the subject, each off by up to half this share of the spacing.
-    scattered_share: share of examples whose inputs stand anywhere instead.
-    mixed_pose_share: share of examples whose inputs may each show another pose (frame).
-    """
+    """Which views of a subject are input and which are targets."""
 
     input_counts: tuple[Few, ...] = (4,)
+    """Numbers of input views; one is drawn per step (each compiles once)."""
     target_count: Few = 3
+    """Target views."""
     jitter: Spread = 0.7
+    """Inputs stand evenly around the subject, each off by up to half this share of the spacing."""
     scattered_share: Share = 0.2
+    """Of examples whose inputs stand anywhere instead."""
     mixed_pose_share: Share = 0.3
+    """Of examples whose inputs may each show another pose (frame)."""
     rule: Literal["random", "window"] = "random"
+    """"random": inputs stand around the subject, targets are drawn from all other views, of any pose. "window": the release's. Of
+    a random window in the order of the views, whose ends are 25 to 59 views apart where a subject has 60 (in proportion for other
+    counts), take the two ends, then random views inside; the first of these are input, the last targets. jitter, scattered_share
+    and mixed_pose_share are not used."""
 
 
 class StoredSubject(NamedTuple):

@@ -75,22 +75,26 @@ Layout = Literal["scenes", "capture"]
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a preprocessed set is made with.
-
-    kind: "thuman", "thuman4" or "avatarrex". layout: of the output. size: pixels a side.
-    Of scans: views, factors (range of the distance in bounding radii), supersample (samples along a pixel), train and test
-    (scans of each split). Of videos: every (the frame step).
-    """
+    """What a preprocessed set is made with."""
 
     kind: str
+    """Of `data.formats.DATASETS`."""
     layout: Layout = "scenes"
+    """Of the output."""
     size: int = SIZE
+    """Pixels a side."""
     views: int = VIEWS
+    """Of a scan."""
     factors: tuple[float, float] = FACTORS
+    """Of scans: range of the distance in bounding radii."""
     supersample: int = 3
+    """Of scans: samples along a pixel."""
     every: int = EVERY
+    """Of videos: the frame step."""
     train: int = TRAIN
+    """Scans of the training list."""
     test: int = TEST
+    """Scans of the test list."""
 
     @property
     def mark(self) -> str:
