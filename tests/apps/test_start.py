@@ -233,7 +233,7 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected,
         shutil.rmtree(mine / name)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert (
-        "2 people in 0_00.png, 0_01.png, 0_02.png, ... (4 photos): expected one. Person 0 to 1: numbers on me/people.png"
+        "2 people in 0_00.png, 0_01.png, 0_02.png, 0_03.png: expected one. Person 0 to 1: numbers on me/people.png"
         in (capsys.readouterr().err)
     )
     assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None

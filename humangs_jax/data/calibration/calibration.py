@@ -319,7 +319,7 @@ def _in_photo(
     return source
 
 
-def _squared_reach(coefficients: Sequence[float] | np.ndarray) -> float:
+def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
     """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
     roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3])  # 1 / r^2, so that tiny coefficients are not divided by
