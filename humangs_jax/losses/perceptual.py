@@ -10,7 +10,7 @@ All is for ONE image in [0, 1]; batch with `jax.vmap`. `losses.loss_networks` re
 import functools
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -146,7 +146,7 @@ def smallest_side(slices: Slices) -> int:
     return next(side for side in itertools.count(1) if fits(side))
 
 
-def _size_after(layer, size):
+def _size_after(layer: Conv | Pool, size: Any) -> Any:
     """Of a convolution or a pool on maps of a size: an int, or an array of several."""
     margin = 2 * layer.padding if isinstance(layer, Conv) else (layer.stride - 1) * layer.ceil
     return (size + margin - layer.size) // layer.stride + 1
@@ -173,7 +173,7 @@ def feature_maps(
     return maps
 
 
-def _cleared(x, size):
+def _cleared(x: Float[Array, "y x c"], size: Int[Array, "2"] | None) -> Float[Array, "y x c"]:
     """A map with zeros beyond its size: what a convolution finds outside of an image."""
     if size is None:
         return x
@@ -181,7 +181,9 @@ def _cleared(x, size):
     return jnp.where((inside[0][:, None] & inside[1])[..., None], x, 0)
 
 
-def _apply(weights, layer, x, size):
+def _apply(
+    weights: Weights, layer: Layer, x: Float[Array, "y x c"], size: Int[Array, "2"] | None
+) -> tuple[Float[Array, "i j d"], Int[Array, "2"] | None]:
     if isinstance(layer, Fire):
         first, *expand = layer.convolutions
         x, size = _apply(weights, first, x, size)
@@ -192,16 +194,17 @@ def _apply(weights, layer, x, size):
     return _cleared(x, size), size
 
 
-def _convolve(weights, layer, x):
+def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Float[Array, "i j d"]:
     if (layer.size, layer.stride, layer.padding) == (3, 1, 1):
         y = convolve(x[None], weights.kernel)
     else:
-        stride, padding, layout = (layer.stride,) * 2, [(layer.padding,) * 2] * 2, ("NHWC", "HWIO", "NHWC")
+        stride, padding = (layer.stride,) * 2, [(layer.padding, layer.padding)] * 2
+        layout = ("NHWC", "HWIO", "NHWC")
         y = jax.lax.conv_general_dilated(x[None], weights.kernel, stride, padding, dimension_numbers=layout)
     return jax.nn.relu(y[0] + weights.bias)
 
 
-def _pool(layer, x):
+def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
     """Columns, then rows, by strided slices: seven times as fast on a CPU as a windowed reduction and its gradient."""
     if layer.ceil:
         missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
@@ -214,7 +217,7 @@ def _pool(layer, x):
     return x / layer.size**2 if layer.average else x
 
 
-def _larger(x, y):
+def _larger(x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b"]:
     # of equal values (plain backgrounds) the first gets the gradient, as in torch; NaN propagates
     return jnp.where((y > x) | jnp.isnan(y), y, x)
 
@@ -234,7 +237,7 @@ class Lpips:
     net: str = static_field()
 
 
-def _unit(x):
+def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
     return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
 
 

@@ -262,7 +262,7 @@ def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> C
         return _load_checkpoint(path, head_width)
 
 
-def _load_checkpoint(path, head_width):
+def _load_checkpoint(path: str | os.PathLike, head_width: int | None) -> Converted:
     state, skipped = read_state_dict(path)
     try:
         config = infer_config(state, head_width)

@@ -139,7 +139,7 @@ def convolve(x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]) -> Flo
     return lax.platform_dependent(x, kernel, cpu=_convolve_on_cpu, default=_convolve)
 
 
-def _convolve(x, kernel):
+def _convolve(x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]) -> Float[Array, "v h w d"]:
     return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT)
 
 

@@ -200,7 +200,9 @@ class Transformer(nn.Module):
                     collected.append(x)
         return [*collected, layer_norm(runtime.compute_dtype, "norm", use_bias=True)(x)]
 
-    def _scan_blocks(self, x, count, quarters):
+    def _scan_blocks(
+        self, x: Float[Array, "l d"], count: Int[Array, ""] | None, quarters: tuple[int, ...]
+    ) -> tuple[Float[Array, "l d"], list[Float[Array, "l d"]]]:
         """The blocks as one loop over their stacked parameters: (output, outputs at the quarters)."""
         config, remat = self.config, self.runtime.remat
         block = Block(config, self.runtime, 0, parent=None)

@@ -230,7 +230,7 @@ def shell_spread(logits: Float[Array, "n k s"], features: VertexFeatures) -> Flo
     return _mean(chosen, distances**2) - _mean(chosen, distances) ** 2
 
 
-def _mean(weights, values):
+def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:
     """(n, k) means of (s,) values under weights (n, k, s): metres, that an accelerator may not round to 8 bits."""
     return jnp.matmul(weights, values, precision=EXACT)
 

@@ -82,7 +82,7 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
         return _load_weights(path)
 
 
-def _load_weights(path):
+def _load_weights(path: str | os.PathLike) -> tuple[Variables, HumanGSConfig]:
     tensors, _, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"

@@ -5,13 +5,13 @@ The targets stay true. The network learns to place Gaussians well although its p
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Range, Share, Spread, configuration
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example
@@ -64,7 +64,7 @@ def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -
     return jax.lax.cond(chosen, augmented, exposed, example)
 
 
-def _gains(key, count, dtype, config):
+def _gains(key: Key, count: int, dtype: Any, config: Augmentation) -> Float[Array, "v 1 1 3"]:
     """(v, 1, 1, 3), one exposure for each photo."""
     gain_key, tint_key = jax.random.split(key)
     gain = config.exposure * jax.random.normal(gain_key, (count, 1, 1, 1), dtype)
@@ -106,7 +106,7 @@ def augment_photos(
     return jnp.clip(cut[..., None] * (seen - 1) + 1, 0, 1), cut
 
 
-def _grown(masks, radii, most):
+def _grown(masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int) -> Float[Array, "v h w"]:
     """Masks dilated by radii > 0 and eroded by radii < 0, in pixels; squares grow to squares."""
     for radius in range(1, most + 1):
         larger, smaller = _largest_near(masks), -_largest_near(-masks)
@@ -115,7 +115,7 @@ def _grown(masks, radii, most):
     return masks
 
 
-def _largest_near(images):
+def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
     """Maxima over 3 x 3 pixels; what is beyond the border repeats it."""
     for axis in (1, 2):
         size = images.shape[axis]

@@ -251,7 +251,7 @@ def load_config(out: str | Path) -> TrainConfig:
     return read_config(path)
 
 
-def _placed_as(value, like):
+def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
     """Through numpy: the buffers are XLA's own then, and may be donated. Uncommitted stays uncommitted: no recompiling."""
     if not value.is_fully_addressable:
         return value
@@ -259,11 +259,11 @@ def _placed_as(value, like):
     return jax.device_put(host, like.sharding) if like.committed else jnp.asarray(host)
 
 
-def _as_dict(state):
+def _as_dict(state: TrainState) -> dict[str, Any]:
     return {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
 
 
-def _flat(tree, prefix=""):
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """{"loss.squared": 1.0, ...} from nested dicts."""
     items = {}
     for name, value in tree.items():

@@ -143,7 +143,7 @@ def compiled_for(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, **HOST_SETTINGS)
 
 
-def _changed(config, stage):
+def _changed(config: TrainConfig, stage: Stage) -> TrainConfig:
     model = config.model
     if stage.image_size is not None:
         model = model.with_conventions(image_size=stage.image_size)

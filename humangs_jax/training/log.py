@@ -10,7 +10,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,7 @@ class RunLog:
         if self._recording:
             say(f"step {done}: {message}")
 
-    def _write(self, record):
+    def _write(self, record: dict[str, Any]) -> None:
         if self._lines is not None:  # JSON has no NaN
             finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
             with _naming(self._lines.name):
@@ -167,7 +167,7 @@ def forget_after(path: Path, step: int) -> None:
 
 
 @contextlib.contextmanager
-def _naming(path):
+def _naming(path: Any) -> Generator[None]:
     """A full disk becomes an error that names the file."""
     try:
         yield
@@ -175,7 +175,7 @@ def _naming(path):
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def _tensorboard(folder, step):
+def _tensorboard(folder: Path, step: int) -> Any:
     try:
         from tensorboardX import SummaryWriter
     except ImportError:  # optional: the log has the same numbers

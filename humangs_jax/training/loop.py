@@ -19,8 +19,11 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
+from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.progress import say, stage
 from humangs_jax.data.loading import Waiting
@@ -101,7 +104,19 @@ def train(
         return _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress)
 
 
-def _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress):
+def _train(
+    config: TrainConfig,
+    body: BodyModel,
+    training: Sequence[str | Path] | MakeSource,
+    out: Path,
+    leading: bool,
+    validation: Sequence[str | Path] | MakeSource,
+    variables: Variables | None,
+    networks: LossNetworks,
+    fsdp: int | None,
+    stop_at: int | None,
+    progress: bool,
+) -> TrainState:
     save_config(out, config, write=leading)
     of = lambda people: captured_people(people, body) if isinstance(people, Sequence) else people
     make_source, unseen = of(training), of(validation) if validation else None
@@ -173,7 +188,15 @@ def _train(config, body, training, out, leading, validation, variables, networks
     return state
 
 
-def _rehearse(make_source, config, step, state, body, networks, mesh):
+def _rehearse(
+    make_source: MakeSource,
+    config: TrainConfig,
+    step: int,
+    state: TrainState,
+    body: BodyModel,
+    networks: LossNetworks,
+    mesh: Mesh | None,
+) -> None:
     """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle of it."""
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
     part = config.at(step)
@@ -181,7 +204,7 @@ def _rehearse(make_source, config, step, state, body, networks, mesh):
     jax.eval_shape(one, state, batch, body, networks, seed_numbers(part.seed))
 
 
-def _report(log, out, done, numbers, image):
+def _report(log: RunLog, out: Path, done: int, numbers: dict[str, float], image: Float[np.ndarray, "h w 3"]) -> None:
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image)
     log.image(done, "validation/sheet", image)
@@ -207,7 +230,7 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
 
 
 @contextlib.contextmanager
-def _own_signals():
+def _own_signals() -> Generator[threading.Event]:
     """An event that SIGINT and SIGTERM set; a second signal does what it did before."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals

@@ -7,7 +7,7 @@ the network is small beside what it computes).
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
@@ -92,7 +92,7 @@ def whole(tree: T, mesh: Mesh) -> T:
 
 
 @functools.cache
-def _replicate(mesh):
+def _replicate(mesh: Mesh) -> Callable[[PyTree], PyTree]:
     return jax.jit(lambda tree: tree, out_shardings=replicated(mesh))
 
 

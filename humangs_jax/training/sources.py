@@ -144,7 +144,7 @@ def training_people(
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
 
 
-def _bank(people, out, body):
+def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
     """The bank in out/people.npz, which one process makes unless it is there."""
     path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:

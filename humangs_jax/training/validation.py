@@ -91,7 +91,7 @@ def validate(
     return _means(names, rows), images
 
 
-def _means(names, rows):
+def _means(names: Sequence[str], rows: list[dict[str, float]]) -> dict[str, float]:
     """Over all processes, some of which may have no rows."""
     own = np.asarray([[row[name] for name in names] for row in rows]).reshape(-1, len(names))
     totals = np.append(own.sum(axis=0), len(own))
