@@ -25,7 +25,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyPose, Texels
 from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
-from humangs_jax.core.configuration import Part
+from humangs_jax.core.configuration import Part, Patch
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
@@ -215,7 +215,7 @@ class Encoder(Part, nn.Module):
     patch_size: field; the side of photos is a multiple of it, pixels.
     """
 
-    patch_size: int = 1
+    patch_size: Patch = 1
 
     def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
         """The encoding."""
