@@ -3,7 +3,11 @@
 import sys
 from pathlib import Path
 
+import pytest
+
+from humangs_jax.avatar.export import EXPORTS, VIDEOS
 from humangs_jax.core.registry import FOLDER, Format, Formats, alternatives
+from humangs_jax.data.formats import DATASETS, MOTIONS
 
 TABLE = Formats(
     one=Format("ours", "colorsys:rgb_to_hsv", (".npz", ".pkl")),
@@ -31,3 +35,12 @@ def test_a_row_added_in_one_line_is_listed_and_called(monkeypatch):
     assert table.recognized(Path("a.other")) is None
     assert alternatives(TABLE.suffixes) == ".npz, .pkl, .json, .mine or a folder"
     assert Formats(a=Format("A", len), b=Format("B", len)).listed() == "a: A; b: B"
+
+
+@pytest.mark.parametrize(
+    ("page", "table"), [("motions", MOTIONS), ("export", EXPORTS), ("video", VIDEOS), ("datasets", DATASETS)]
+)
+def test_the_page_of_a_table_has_every_format(page, table):
+    text = (Path(__file__).parents[2] / "docs" / f"{page}.md").read_text()
+    names = {name: each.suffixes or (each.about.split(" and ")[0],) for name, each in table.items()}
+    assert not [name for name, words in names.items() if not any((word or "folder") in text for word in words)]
