@@ -54,7 +54,7 @@ def json_text(value: Any, indent: str = "") -> str:
     elif isinstance(value, list | tuple) and any(isinstance(item, dict | list | tuple) for item in value):
         items, brackets = [json_text(item, inner) for item in value], "[]"
     else:
-        return json.dumps(value, ensure_ascii=False)
+        return json.dumps(value, ensure_ascii=False, default=lambda array: array.tolist())  # of numpy
     return f"{brackets[0]}\n" + ",\n".join(inner + item for item in items) + f"\n{indent}{brackets[1]}"
 
 
