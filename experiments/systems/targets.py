@@ -15,7 +15,7 @@ import numpy as np
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.frames import draw_gaussians
 from humangs_jax.avatar.reconstruct import fit_buffers, make_avatar
-from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
+from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_body
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -49,7 +49,7 @@ class GaussianDriver(Driver):
         """The Gaussians of one frame, posed, and before that. variables: the driver's own."""
         target = Target(pose, person_vertices(body, betas, pose))
         driven = cast(HumanGSOutputs, self.apply(variables, outputs, target, config.run()))
-        return skin(make_avatar(driven, body, betas, config), pose), driven
+        return skin(make_avatar(driven, body, shape_body(body, betas), config), pose), driven
 
     @nn.nowrap
     def draw(

@@ -14,14 +14,24 @@ import numpy as np
 from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
-from humangs_jax.body.model import BodyModel, BodyPose, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
-from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.array_types import Array, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.displacement import displacement
 from humangs_jax.data.exposure import equal_exposure
-from humangs_jax.data.views import SubjectViews, fits, gaussian_body, pad_views, prepare_inputs, standardize, upright
+from humangs_jax.data.views import (
+    SubjectViews,
+    fits,
+    gaussian_body,
+    pad_views,
+    prepare_inputs,
+    standardize,
+    subject_rest,
+    upright,
+)
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.io.reading import check_limit
@@ -46,17 +56,17 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
     correction of a frame. Worlds that are not y-up are turned for the network (`data.views.upright`); the
     avatar then has no light, whose directions would be those of another world. Views whose mask does not show the person are left
-    out (`data.usable_views`), and the exposure of the others is made equal (`data.exposure`).
+    out (`data.usable_views`), and the exposure of the others is made equal (`data.exposure`). With `Runtime.displacement` the
+    body is displaced to the masks first (`data.displacement`); the avatar keeps that.
 
     Raises: ValueError if the network makes no Gaussians, the capture has no view, none that shows the person, or values that are
     not finite or out of range, naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
-    photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
-    views, count = upright(photos, capture.body), len(photos.images)
-    turned, bucket = views is not photos, round_up(count, smallest=1)
-    if bucket > count:
+    views, turned = _views(capture, body, config)
+    count = len(views.images)
+    if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
     _check_posed(inputs, "capture")
@@ -120,15 +130,31 @@ def _stacked(config, captures):
     coefficients = max(len(capture.betas) for capture in captures)
     subjects, turned = [], []
     for capture in captures:
-        photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
-        turned.append((views := upright(photos, capture.body)) is not photos)
+        views, moved = _views(capture, body, config)
+        turned.append(moved)
         views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
-        subjects.append(replace(views, betas=betas))
+        still = jnp.zeros_like(body.template) if displaces(config) else None  # of photos without masks
+        displaced = still if views.displacement is None else views.displacement
+        subjects.append(replace(views, betas=betas, displacement=displaced))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
     _check_posed(inputs, "captures")
     return body, batch, fit_buffers(inputs, config), turned
+
+
+def _views(capture, body, config):
+    """What the network gets of a capture; and whether its world has been turned."""
+    photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
+    views = upright(photos, capture.body)
+    if displaces(config) and capture.masks is not None:
+        views = replace(views, displacement=jnp.asarray(displacement(body, capture)))
+    return views, views.cameras is not photos.cameras
+
+
+def displaces(config: HumanGSConfig) -> bool:
+    """Whether the body is displaced to the masks: if the network looks at the person's pixels alone."""
+    return config.runtime.displacement and config.conventions.pixels == "person"
 
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
@@ -165,12 +191,11 @@ def _reconstruct(variables, config, body, views):
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 
 
-def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " s"], config: HumanGSConfig) -> Avatar:
-    """Canonical Gaussians on the body of a person: what can be posed. Raises: ValueError if there are none."""
+def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig) -> Avatar:
+    """Canonical Gaussians on the body of a person, shaped to `rest`: what can be posed. Raises: ValueError if there are none."""
     if outputs.is_empty:
         name = type(config.architecture.decoder).__name__
         raise ValueError(f"{name} draws images without Gaussians: there is no avatar to make or animate")
-    rest = shape_body(body, betas)
     weights, per_vertex = outputs.skinning_weights, outputs.gaussians.means.shape[0] // body.template.shape[0]
     if weights is None:
         weights = corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex)
@@ -189,7 +214,7 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " 
 
 def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> Avatar:
     """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
-    conventions, avatar = config.conventions, make_avatar(outputs, body, views.betas, config)
+    conventions, avatar = config.conventions, make_avatar(outputs, body, subject_rest(body, views), config)
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
         avatar = with_spread_weights(
             avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach

@@ -109,7 +109,7 @@ def surface_points(
     skinning, rest, corners = np.asarray(body.skinning_weights)[used], rest[used], corners.reshape(weights.shape)
     posed = {}
     for frame in sorted(set(frames)):
-        moves = _joint_moves(joints, body.parents, np.asarray(rotations[frame], float))
+        moves = joint_moves(joints, body.parents, np.asarray(rotations[frame], float))
         blended = (skinning @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
         vertices = np.einsum("nrc,nc->nr", blended[..., :3], rest) + blended[..., 3] + translations[frame]
         posed[frame] = np.einsum("pc,pcx->px", weights, vertices[corners])
@@ -142,17 +142,21 @@ def _sampling(
     return faces[np.minimum(chosen, len(faces) - 1)], np.stack([1 - u - v, u, v], axis=-1)
 
 
-def _joint_moves(
-    joints: Float[np.ndarray, "j 3"], parents: Sequence[int], rotations: Float[np.ndarray, "j 3"]
-) -> Float[np.ndarray, "j 3 4"]:
-    """Rigid transforms from the rest pose to the pose."""
+def joint_turns(rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3 3"]:
+    """Rotation matrices of axis-angles."""
     angles = np.linalg.norm(rotations, axis=-1)
     x, y, z = (rotations / np.maximum(angles, 1e-12)[:, None]).T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
     sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    local = np.eye(3) + sine * cross + (1 - cosine) * cross @ cross
-    moves = np.zeros((len(parents), 3, 4))
+    return np.eye(3) + sine * cross + (1 - cosine) * cross @ cross
+
+
+def joint_moves(
+    joints: Float[np.ndarray, "j 3"], parents: Sequence[int], rotations: Float[np.ndarray, "j 3"]
+) -> Float[np.ndarray, "j 3 4"]:
+    """Rigid transforms from the rest pose to the pose."""
+    local, moves = joint_turns(rotations), np.zeros((len(parents), 3, 4))
     for j, parent in enumerate(parents):  # parents come first
         turn = local[j] if parent < 0 else moves[parent, :, :3] @ local[j]
         place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]

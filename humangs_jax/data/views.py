@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.body.resolution import decimate, split_long_edges, vertex_areas
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
@@ -44,7 +44,8 @@ class SubjectViews:
     images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
     rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
     views, those after them are padding (see `pad_views`); None: all are. depths: (v, h, w) mean z of the person in a pixel,
-    metres, where the mask is not 0; 0: unknown there. None: unknown everywhere.
+    metres, where the mask is not 0; 0: unknown there. None: unknown everywhere. displacement: (n, 3) of the vertices of the
+    shaped body in the T-pose, metres (`data.displacement`); None: none.
     """
 
     images: Float[Array, "v h w 3"]
@@ -55,6 +56,7 @@ class SubjectViews:
     betas: Float[Array, " s"]
     view_count: Int[Array, ""] | None = None
     depths: Float[Array, "v h w"] | None = None
+    displacement: Float[Array, "n 3"] | None = None
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
@@ -134,13 +136,21 @@ def _remeshed(key, vertices, edge, fewer, longest, wanted):
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 
+def subject_rest(body: BodyModel, views: SubjectViews) -> RestBody:
+    """The person's body in the T-pose; a displacement does not move the joints."""
+    rest = shape_body(body, views.betas)
+    if views.displacement is None:
+        return rest
+    return replace(rest, vertices=rest.vertices + views.displacement)
+
+
 @checked_arguments
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     """Pose the body for every view and rasterize it: position maps, depth maps and the foreground of the photos.
 
     Pure and jittable; nothing here is differentiated with respect to the body.
     """
-    rest = shape_body(body, views.betas)
+    rest = subject_rest(body, views)
 
     def pose_view(rotations: Float[Array, "j 3"], translation: Float[Array, "3"]) -> Float[Array, "n 3"]:
         return pose_body(body, rest, BodyPose(rotations, translation)).vertices

@@ -75,6 +75,14 @@ class Runtime:
         measured=EVALUATION,
     )
     """Photos are cut to the square around the person's mask before they are brought to that size."""
+    displacement: bool = knob(
+        False,
+        cost="half a second; PSNR where the body is right already",
+        gain="bodies that are a centimetre off: boundaries, hems",
+        measured="benchmarks/quality.md",
+    )
+    """The body is moved to the edges of the masks first (`data.displacement`); for weights that
+    look at the pixels of the "person"."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
 

@@ -56,8 +56,8 @@ MOST_PHOTOS = 6
 class Signals:
     """What photos say about g Gaussians; without the axis v: one photo.
 
-    gradients: of the sum of squared errors of colors and coverage. visibility: largest weight on a pixel. pixels: sum of the
-    weights.
+    gradients: of the sum of squared errors of colors and coverage; those of the Gaussians' colors by the foreground alone.
+    visibility: largest weight on a pixel. pixels: sum of the weights.
     """
 
     gradients: Float[Array, "*v g 14"]
@@ -267,8 +267,9 @@ def photo_signals(
     """Signals of one photo (without the axis v), from the pixels that count; and the overflow. splat: with `visibility`."""
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses)
     gradient, _ = pulled(pull_back, squared_errors(image, photo))
-    _, colors = pulled(pull_back, colors_alone(image))
-    return signals_from(gradient, colors, rendering, photo), rendering.overflow
+    foreground, _ = pulled(pull_back, foreground_errors(image, photo))
+    _, pixels = pulled(pull_back, colors_alone(image))
+    return signals_from(gradient, foreground, pixels, rendering, photo), rendering.overflow
 
 
 @compiled
@@ -279,18 +280,28 @@ def squared_errors(image: Image, photo: Photo) -> Image:
 
 
 @compiled
+def foreground_errors(image: Image, photo: Photo) -> Image:
+    """Likewise of the colors in the foreground alone: what stands before the background is to fade, not to take its color."""
+    rgb, alpha = squared_errors(image, photo)
+    return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
+
+
+@compiled
 def colors_alone(image: Image) -> Image:
     """Gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
 @compiled
-def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Rendering, photo: Photo) -> Signals:
-    """Signals from `squared_errors` and `colors_alone`, both pulled back to the Gaussians."""
+def signals_from(
+    gradient: Parameters, foreground: Parameters, pixels: Float[Array, " g"], rendering: Rendering, photo: Photo
+) -> Signals:
+    """Signals from `squared_errors`, `foreground_errors` and `colors_alone`, each pulled back to the Gaussians."""
     assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.mask), 1.0)
+    gradient = replace(gradient, color_logits=foreground.color_logits)
     # a change of all three colors of a Gaussian changes the sum of an image by three times its weights
-    return Signals(scale * stacked(gradient), rendering.visibility, scale * colors / 3)
+    return Signals(scale * stacked(gradient), rendering.visibility, scale * pixels / 3)
 
 
 @compiled

@@ -11,6 +11,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
     _assemble_compiled,
+    _views,
     make_avatar,
     reconstruct,
     reconstruct_batch,
@@ -397,6 +398,16 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
         alone = reconstruct(variables, config, photos)
         assert jax.tree.structure(avatar) == jax.tree.structure(alone)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), avatar, alone)
+
+
+def test_masks_displace_the_body_if_the_network_looks_at_the_person_alone(body, network):
+    config, photos = network[1].with_conventions(pixels="person"), capture_of(body, 0, 2)
+    photos = dataclasses.replace(photos, masks=np.ones_like(photos.masks))
+    on = config.with_runtime(displacement=True)
+    moved = lambda photos, config: _views(photos, gaussian_body(body, config), config)[0].displacement
+    assert moved(photos, on).shape == body.template.shape
+    assert moved(dataclasses.replace(photos, masks=None), on) is None  # then the result is what it was, bit for bit
+    assert moved(photos, on.with_conventions(pixels="all")) is None and moved(photos, config) is None
 
 
 @pytest.mark.slow

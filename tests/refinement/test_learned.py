@@ -151,12 +151,20 @@ def test_gradients_are_those_of_the_squared_error(scene):
     def error(shift):
         moved = replace(parameters, color_logits=parameters.color_logits.at[most].add(shift))
         rendering = drawn(scene, moved)
-        squared = np.square(rendering.rgb - photo.image, dtype=np.float64).sum()
-        return squared + np.square(rendering.alpha - photo.mask, dtype=np.float64).sum()
+        squared = np.square(rendering.rgb - photo.image, dtype=np.float64)
+        return (np.asarray(photo.mask, np.float64)[..., None] * squared).sum()
 
     slope = (error(DIFFERENCE) - error(-DIFFERENCE)) / (2 * DIFFERENCE)
     gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.mask.sum()) / PERSON
     assert gradient == pytest.approx(slope, rel=DIFFERENCES)
+
+
+def test_the_background_says_nothing_of_colors_but_something_of_the_rest(scene):
+    photo = replace(scene[1], mask=jnp.round(scene[1].mask))  # the rims of Gaussians stand before the background
+    black = replace(photo, image=photo.mask[..., None] * photo.image)
+    before, after = (np.asarray(signals_of(scene, x).gradients) for x in (photo, black))
+    np.testing.assert_allclose(after[:, 11:], before[:, 11:], atol=ROUNDING * np.abs(before[:, 11:]).max())
+    assert np.abs(after - before)[:, :11].max() > 0.01 * np.abs(before[:, :11]).max()
 
 
 def test_a_run_sees_the_signals_of_training(scene):

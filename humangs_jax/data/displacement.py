@@ -1,0 +1,249 @@
+"""A body that fills the masks: its vertices are moved along their normals until its silhouettes meet those of all photos.
+
+Where a vertex lies on the body's own silhouette in a photo, the mask's edge along its normal says how far it should move. A
+sparse least-squares fit carries this over the rest of the mesh, smoothly:
+
+    sum over photos of (t - target)^2 + WEAKNESS t^2 + SMOOTHNESS^4 (Laplacian t)^2,    per area,
+
+so that a section between two photos becomes round. What is then still outside a mask is moved inwards. Clothes become part of the
+body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). On the host, by numpy and scipy: nothing is compiled.
+"""
+
+import dataclasses
+
+import numpy as np
+from PIL import Image, ImageDraw
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.resolution import vertex_areas
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.masks import box_of, signed_distance
+from humangs_jax.data.usable_views import MASK_THRESHOLD, joint_moves, joint_turns, unusable_views
+from humangs_jax.io.images import resized
+
+INSET = (0.005, 0.025)
+"""Metres that the body may lie inside the masks: the network adds clothes on top, and knows naked bodies under them."""
+OUTWARDS, INWARDS, STEP = 0.05, 0.06, 0.0025
+"""Metres along the normal within which a mask's edge is looked for, and the steps of the search."""
+SMOOTHNESS = 0.03
+"""Metres over which a displacement spreads."""
+WEAKNESS = 0.002
+"""Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
+HELD = 20.0
+"""The same, for hands and head."""
+HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
+ITERATIONS = 2
+NEAR, PROBE, LEAVES = 2.5, 0.012, 0.6
+"""A vertex is on the body's silhouette if it is within this many pixels of the edge, and if a move by PROBE metres along its
+normal leaves the silhouette by this share of it."""
+DRAWN = 0.5
+"""Pixels by which polygons are drawn larger than they are."""
+WRAP, WRAP_ROUNDS = 0.07, 6
+"""At last, vertices outside a mask move inwards up to the first, metres, until all masks contain them by the inset; the moves are
+averaged over the neighbours this often."""
+LONGEST = 480
+"""Pixels of the window around the person in which silhouettes are compared."""
+MARGIN = 0.12
+"""Around the person, of its height."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _View:
+    """One photo: the window around the person. mask: signed distance to the edge, pixels. project: (3, 4) to the window's pixels.
+
+    linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the photo's corners.
+    """
+
+    mask: Float[np.ndarray, "h w"]
+    project: Float[np.ndarray, "3 4"]
+    linear: Float[np.ndarray, "n 3 3"]
+    offset: Float[np.ndarray, "n 3"]
+    low: Float[np.ndarray, "2"]
+    high: Float[np.ndarray, "2"]
+
+    def seen(self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)) -> tuple:
+        """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo shows."""
+        posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
+        posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
+        clip = posed @ self.project[:, :3].T + self.project[:, 3]
+        depth = np.maximum(clip[..., 2], 1e-3)
+        pixels = clip[..., :2] / depth[..., None]
+        within = (clip[..., 2] > 1e-3) & ((pixels > self.low) & (pixels < self.high)).all(-1)
+        return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
+
+
+def displacement(body: BodyModel, capture: Capture, inset: tuple[float, float] = INSET) -> Float[np.ndarray, "n 3"]:
+    """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it fills the masks; bounded.
+
+    Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks; frames and worlds may be any.
+    Where masks say nothing, or nothing of the body is near them, it is 0.
+    """
+    assert capture.masks is not None
+    betas = np.asarray(capture.betas, float)
+    rest = np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
+    views = _views(body, rest, capture)
+    total = np.zeros_like(rest)
+    if not views:
+        return total.astype(np.float32)
+    faces = np.asarray(body.faces)
+    held = HELD * np.asarray(body.skinning_weights) @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
+    for _ in range(ITERATIONS):
+        moved, normals = rest + total, _normals(rest + total, faces)
+        count, summed = _targets(views, moved, normals, faces, inset)
+        total += _spread(moved, faces, count, summed, held)[:, None] * normals
+    moved, normals = rest + total, _normals(rest + total, faces)
+    total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
+    return total.astype(np.float32)
+
+
+def _views(body, rest, capture):
+    joints = np.asarray(body.joint_regressor, float) @ rest
+    weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
+    unusable = unusable_views(capture)
+    for i, frame in enumerate(np.asarray(capture.frames).tolist()):
+        mask = np.asarray(capture.masks[i])
+        if i in unusable:
+            continue
+        if frame not in posed:
+            rotations = np.asarray(capture.poses.rotations[frame], float)
+            moves = joint_moves(joints, body.parents, rotations)
+            blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
+            offset = blended[..., 3] + np.asarray(capture.poses.translation[frame], float)
+            if body.pose_directions is not None:
+                features = (joint_turns(rotations)[1:] - np.eye(3)).ravel()
+                correction = np.asarray(body.pose_directions) @ features
+                offset = offset + np.einsum("nab,nb->na", blended[..., :3], correction)
+            posed[frame] = blended[..., :3], offset
+        K, matrix = np.asarray(capture.cameras.K[i], float), np.asarray(capture.cameras.cam_from_world[i], float)
+        if all(np.isfinite(x).all() for x in (rest, *posed[frame])):  # whoever poses the body names what is not
+            views.append(_window(mask, K @ matrix[:3], *posed[frame]))
+    return views
+
+
+def _window(mask, project, linear, offset):
+    """A view, cut to the person and brought to one size. Beyond the border of the photo the mask goes on as it ends there."""
+    (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
+    margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))
+    top, left, bottom, right = top - margin, left - margin, bottom + margin, right + margin
+    height, width = mask.shape
+    pad = ((max(-top, 0), max(bottom - height, 0)), (max(-left, 0), max(right - width, 0)))
+    window = np.pad(mask[max(top, 0) : bottom, max(left, 0) : right], pad, mode="edge")
+    scale = LONGEST / max(window.shape)
+    rows, columns = (max(1, round(side * scale)) for side in window.shape)
+    x, y = columns / window.shape[1], rows / window.shape[0]
+    to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
+    low, high = np.asarray([-left * x, -top * y]), np.asarray([(width - left) * x, (height - top) * y])
+    edges = signed_distance(resized(window, columns, rows))
+    return _View(edges.astype(np.float32), to_window @ project, linear, offset, low + NEAR, high - NEAR)
+
+
+def _targets(views, rest, normals, faces, inset):
+    """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
+    count, summed = np.zeros(len(rest)), np.zeros(len(rest))
+    reach = np.arange(-INWARDS, OUTWARDS + STEP / 2, STEP)
+    for view in views:
+        pixels, per_metre, within = view.seen(rest)
+        own = signed_distance(_silhouette(pixels, faces, view.mask.shape)) - DRAWN
+        probed, _, _ = view.seen(rest + PROBE * normals)
+        leaves = _at(own, probed) < _at(own, pixels) - LEAVES * PROBE * per_metre
+        edge = np.flatnonzero(within & (np.abs(_at(own, pixels)) < NEAR) & leaves)
+        along = rest[edge, None] + reach[:, None] * normals[edge, None]
+        pixels, _, within = view.seen(along, edge)
+        there, found = _crossing(np.where(within, _at(view.mask, pixels), np.nan), reach)
+        here, known = _crossing(_at(own, pixels), reach)
+        found &= known
+        count[edge[found]] += 1
+        gap = (there - here)[found]
+        summed[edge[found]] += gap - np.clip(gap, *inset)
+    return count, summed
+
+
+def _crossing(depths, reach):
+    """Where the mask ends along each normal, nearest to its start: outwards from the inside, inwards from the outside."""
+    zero = int(np.argmin(np.abs(reach)))
+    distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
+    starts_inside = depths[:, zero] > 0
+    for inside, order in ((True, slice(zero, None)), (False, slice(zero, None, -1))):
+        rows = np.flatnonzero(starts_inside == inside)
+        values, places = depths[rows][:, order], reach[order]
+        crossed = (values[:, 1:] <= 0) if inside else (values[:, 1:] > 0)
+        unknown = np.isnan(values).cumsum(1)[:, 1:] > 0
+        first = np.argmax(crossed & ~unknown, axis=1)
+        hit = (crossed & ~unknown)[np.arange(len(rows)), first]
+        a, b = values[np.arange(len(rows)), first], values[np.arange(len(rows)), first + 1]
+        share = np.where(hit, a / np.where(a == b, 1, a - b), 0)
+        distance[rows] = places[first] + np.clip(share, 0, 1) * (places[first + 1] - places[first])
+        found[rows] = hit
+    return distance, found
+
+
+def _silhouette(pixels, faces, shape):
+    """1 where the body is, in a window."""
+    triangles = pixels[faces]
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    image = Image.new("L", shape[::-1])
+    pen = ImageDraw.Draw(image)
+    for corners in (triangles[turn < 0] - 0.5).reshape(-1, 6).tolist():  # the side that faces the camera covers all
+        pen.polygon(corners, fill=1)
+    return np.asarray(image, np.float32)
+
+
+def _spread(vertices, faces, count, summed, held):
+    """The smooth displacement that is nearest to the targets."""
+    areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
+    laplacian = _laplacian(vertices, faces)
+    bending = SMOOTHNESS**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
+    matrix = sparse.diags(areas * (WEAKNESS + count + held)) + bending
+    return np.clip(splu(matrix.tocsc()).solve(areas * summed), -INWARDS, OUTWARDS)
+
+
+def _laplacian(vertices, faces):
+    """By the cotangents of the angles, none of them negative."""
+    rows, columns, values = [], [], []
+    for i in range(3):
+        a, b, c = (faces[:, (i + k) % 3] for k in range(3))
+        u, v = vertices[a] - vertices[c], vertices[b] - vertices[c]
+        cotangent = (u * v).sum(-1) / np.maximum(np.linalg.norm(np.cross(u, v), axis=-1), 1e-10)
+        rows, columns, values = [*rows, a, b], [*columns, b, a], [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2]
+    size = len(vertices)
+    weights = sparse.coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)
+    ).tocsr()
+    return (sparse.diags(np.asarray(weights.sum(axis=1))) - weights).tocsr()
+
+
+def _outside(views, rest, normals, faces, inset, free):
+    """How far each vertex moves inwards until all masks contain it, smoothly."""
+    reach = np.arange(0, WRAP + STEP / 2, STEP)
+    inside = np.full((len(rest), len(reach)), np.inf)
+    for view in views:
+        pixels, per_metre, within = view.seen(rest[:, None] - reach[:, None] * normals[:, None])
+        inside = np.minimum(inside, np.where(within, _at(view.mask, pixels) / per_metre, np.inf))
+    good = inside >= inset[0]
+    move = np.where((inside[:, 0] < 0) & good.any(1) & free, reach[np.argmax(good, axis=1)], 0)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = len(rest)
+    ones = np.ones(len(edges))
+    near = sparse.coo_array((ones, (edges[:, 0], edges[:, 1])), (size, size)).tocsr()
+    near = near + near.T + sparse.eye(size)
+    near = sparse.diags(1 / np.asarray(near.sum(axis=1))) @ near
+    for _ in range(WRAP_ROUNDS):
+        move = near @ move
+    return move
+
+
+def _at(image, pixels):
+    """Bilinear; pixel centres at + 0.5."""
+    x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
+    return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)
+
+
+def _normals(vertices, faces):
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    summed = np.stack([np.bincount(faces.ravel(), across[:, i], len(vertices)) for i in range(3)], axis=-1)
+    return summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)

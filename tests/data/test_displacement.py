@@ -1,0 +1,150 @@
+"""A body that is displaced to the masks: a known coat is found, and masks that say nothing do no harm."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.resolution import decimate
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.data.displacement import HELD_JOINTS, INWARDS, OUTWARDS, WRAP, displacement
+from humangs_jax.data.views import SubjectViews, subject_rest
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+
+SIZE, COAT = 384, 0.01
+FOUND = 0.003
+"""Metres: a pixel of these masks shows 6 mm, and its edge is known to half of that."""
+BOUND = 2 * max(INWARDS, OUTWARDS) + WRAP
+POSES = 2
+
+
+@pytest.fixture(scope="module")
+def body():
+    return decimate(load_body(), 1500)
+
+
+@functools.cache
+def rasterizer():
+    return jax.jit(rasterize_mesh)
+
+
+def masks_of(body, rest, poses, frames, cameras):
+    return np.stack(
+        [
+            np.asarray(rasterizer()(pose_body(body, rest, poses[f]).vertices, body.faces, cameras[i]).face_ids) >= 0
+            for i, f in enumerate(frames)
+        ]
+    ).astype(np.float32)
+
+
+def free(body):
+    """Share of each vertex that belongs neither to the head nor to hands."""
+    held = np.asarray([any(name in joint for name in HELD_JOINTS) for joint in body.joint_names])
+    return 1 - np.asarray(body.skinning_weights) @ held
+
+
+@pytest.fixture(scope="module")
+def dressed(body):
+    """A capture of eight photos in two poses of somebody in a coat, 1 cm thick, and how far its vertices are from the body."""
+    rng = np.random.default_rng(0)
+    betas = jnp.zeros(len(body.shape_names)).at[:2].set(jnp.asarray([0.5, -0.3]))
+    rotations = jnp.asarray(0.15 * rng.normal(size=(POSES, len(body.parents), 3)), jnp.float32)
+    poses = jax.vmap(BodyPose)(rotations, jnp.asarray([[0, 1.0, 0], [0.3, 1.1, 0.2]], jnp.float32))
+    rest = shape_body(body, betas)
+    coat = COAT * free(body)[:, None] * np.asarray(vertex_normals(rest.vertices, body.faces))
+    frames = np.arange(8) % POSES
+    middle, K = jnp.asarray([0.0, 0.75, 0.0]), intrinsics_from_fov(np.pi / 3, SIZE, SIZE)
+    cameras = orbit(middle, 2.2, jnp.linspace(0, 2 * np.pi, 9)[:-1], 0.1, K, SIZE, SIZE)
+    masks = masks_of(body, replace(rest, vertices=rest.vertices + coat), poses, frames, cameras)
+    images = np.ones((*masks.shape, 3), np.float32)
+    capture = capture_from_arrays(
+        images, cameras.K, cameras.cam_from_world, rotations, poses.translation,
+        betas=betas, masks=masks, frames=frames, background="white", body=body,
+    )  # fmt: skip
+    return capture, coat
+
+
+def along_normals(body, capture, moved):
+    normals = np.asarray(vertex_normals(shape_body(body, jnp.asarray(capture.betas)).vertices, body.faces))
+    return (moved * normals).sum(-1)
+
+
+def test_a_coat_is_found(body, dressed):
+    capture, coat = dressed
+    found, true = (along_normals(body, capture, x) for x in (displacement(body, capture, inset=(0.0, 0.0)), coat))
+    worn = free(body) > 0.99
+    errors = np.abs(found - true)[worn]
+    assert np.median(errors) < FOUND / 2 and np.percentile(errors, 90) < FOUND
+    still = np.abs(found)[free(body) < 0.01]
+    assert np.median(still) < FOUND
+
+
+def test_the_inset_is_kept(body, dressed):
+    capture, _ = dressed
+    worn = free(body) > 0.99
+    near, deep = (
+        along_normals(body, capture, displacement(body, capture, (inset, inset)))[worn] for inset in (0.0, 0.004)
+    )
+    assert np.median(near - deep) == pytest.approx(0.004, abs=FOUND / 2)
+
+
+def test_joints_stay(body, dressed):
+    capture, _ = dressed
+    blank = jnp.zeros((1, 8, 8, 3))
+    views = SubjectViews(blank, blank[..., 0], capture.cameras[:1], jnp.zeros((1, len(body.parents), 3)), jnp.zeros((1, 3)),
+                         jnp.asarray(capture.betas))  # fmt: skip
+    moved = replace(views, displacement=jnp.asarray(displacement(body, capture, (0.0, 0.0))))
+    before, after = subject_rest(body, views), subject_rest(body, moved)
+    np.testing.assert_array_equal(before.joints, after.joints)
+    assert np.abs(np.asarray(after.vertices - before.vertices)).max() > COAT / 2
+
+
+def shifted(masks):
+    return np.roll(masks, 60, axis=2)
+
+
+def cut(masks):
+    """The lower half of each photo is missing: the person touches the border."""
+    return masks[:, : SIZE // 2]
+
+
+SPOILED = {
+    "one photo": lambda c: c.select([0]),
+    "a body that is not finite": lambda c: dataclasses.replace(c, betas=np.full_like(c.betas, np.nan)),
+    "an empty mask": lambda c: dataclasses.replace(c, masks=c.masks * (np.arange(8) > 0)[:, None, None]),
+    "all masks empty": lambda c: dataclasses.replace(c, masks=0 * c.masks),
+    "masks of all": lambda c: dataclasses.replace(c, masks=np.ones_like(c.masks)),
+    "masks far off": lambda c: dataclasses.replace(c, masks=shifted(c.masks)),
+    "a hole": lambda c: dataclasses.replace(c, masks=c.masks * (np.arange(SIZE) % 40 > 9)),
+    "a spot": lambda c: dataclasses.replace(c, masks=c.masks * (np.hypot(*(np.mgrid[:SIZE, :SIZE] - SIZE / 2)) < 6)),
+}
+
+
+@pytest.mark.parametrize("spoiled", SPOILED)
+def test_bad_masks_do_bounded_harm(body, dressed, spoiled):
+    capture = SPOILED[spoiled](dressed[0])
+    moved = displacement(body, capture)
+    assert moved.shape == body.template.shape and moved.dtype == np.float32
+    assert np.isfinite(moved).all() and np.linalg.norm(moved, axis=-1).max() < BOUND
+    if spoiled in ("all masks empty", "masks of all", "a body that is not finite"):
+        np.testing.assert_array_equal(moved, 0)
+
+
+def test_the_border_of_a_photo_is_no_edge_of_the_person(body, dressed):
+    capture, coat = dressed
+    half = SIZE // 2
+    cameras = replace(capture.cameras, height=half)
+    upper = dataclasses.replace(
+        capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras
+    )
+    found, true = (along_normals(body, capture, x) for x in (displacement(body, upper, inset=(0.0, 0.0)), coat))
+    errors = np.abs(found - true)
+    assert np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND  # what no photo shows stays where it was
