@@ -30,8 +30,7 @@ from humangs_jax.detection.people import detect_people
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.fit_capture import fit_photos
-from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_iterations import overlap, posed_vertices
+from humangs_jax.fitting.refine import overlap, posed_vertices, refine_capture
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.weights import load_weights

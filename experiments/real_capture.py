@@ -27,11 +27,10 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks, bilinear
-from humangs_jax.detection.people import DetectedPerson, detect_people
-from humangs_jax.detection.sharpening import sharpened
+from humangs_jax.detection.people import DetectedPerson, detect_people, sharpened
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
-from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene
+from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.io.npz import write_npz

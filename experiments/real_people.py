@@ -41,7 +41,7 @@ from humangs_jax.data.photos import Photos
 from humangs_jax.detection.blazepose import Networks, bilinear
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
-from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene, moved_capture, posed_vertices
+from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, moved_capture, posed_vertices
 from humangs_jax.fitting.similarity import Similarity, align_points
 from humangs_jax.fitting.state import StateStd
 from humangs_jax.geometry.camera import Camera, stack_cameras

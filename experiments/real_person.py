@@ -49,8 +49,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
-from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_iterations import usual_config
+from humangs_jax.fitting.refine import refine_capture, usual_config
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.refine import refine

@@ -31,7 +31,7 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.fitting.camera_errors import find_camera_errors
-from humangs_jax.fitting.examination import Examination
+from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8, write_png

@@ -27,8 +27,7 @@ from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, seen_person,
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
-from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
-from humangs_jax.detection.sharpening import sharpened
+from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people, sharpened
 from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colors, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files

@@ -64,6 +64,23 @@ def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetre
     return Place(name, base, (x / 1000, y / 1000, z / 1000), joints)
 
 
+CARRIERS = {
+    **dict.fromkeys(("nose", "ear", "heel", "big_toe", "small_toe"), ()),
+    **{"eye": ("head",), "shoulder": ("{side}_collar",), "elbow": ("{side}_shoulder",), "wrist": ("{side}_elbow",)},
+    **{"hip": ("pelvis",), "knee": ("{side}_hip",), "ankle": ("{side}_knee",)},
+}
+"""The joints whose turning carries what lies beside a landmark; none: what carries its vertex."""
+
+
+def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
+    """Landmarks that lie where this module has them, as far as fits may find them elsewhere."""
+    sides = [name.split("_", 1) if name.startswith(("left_", "right_")) else ("", name) for name in names]
+    known = [(name, side, part) for name, (side, part) in zip(names, sides, strict=True) if part in CARRIERS]
+    return tuple(
+        Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part])) for n, side, part in known
+    )
+
+
 def both_sides(
     names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
 ) -> tuple[Place, Place]:
@@ -98,25 +115,63 @@ class LandmarkModel:
 
     joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change, metres. points: p of the surface.
     regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the body lacks a landmark.
-    Static: names; known, which of them the body has; parents, joint_names; movers, the joints whose turning moves a landmark.
+    certainty: (k,) weights of errors, see `LESS_CERTAIN`. Static: names; known, which of them the body has; parents, joint_names;
+    movers, the joints whose turning moves a landmark; placed, of the last points, which are those of `places`, the rows; groups:
+    (group, side) of these: of a pair, and of what is in the middle; side 1, and -1 for what is mirrored.
     """
 
     joints: Float[Array, "j 3"]
     joint_directions: Float[Array, "j 3 s"]
     points: SurfacePoints
     regressor: Float[Array, "k jp"]
+    certainty: Float[Array, " k"]
     names: tuple[str, ...] = static_field(default=())
     known: tuple[bool, ...] = static_field(default=())
     parents: tuple[int, ...] = static_field(default=())
     joint_names: tuple[str, ...] = static_field(default=())
     movers: tuple[int, ...] = static_field(default=())
+    placed: tuple[int, ...] = static_field(default=())
+    groups: tuple[tuple[int, int], ...] = static_field(default=())
+
+    def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
+        """The model with more offsets of its places, metres, one for each group; x of a mirrored one is turned round."""
+        if not self.placed:
+            return self
+        which, sides = np.asarray(self.groups).T
+        own = offsets[which] * np.stack([sides, np.ones_like(sides), np.ones_like(sides)], axis=-1)
+        rest = self.points.rest.at[-len(which) :].add(own)
+        return replace(self, points=replace(self.points, rest=rest))
+
+    def by_landmark(self, offsets: Float[Array, "g 3"]) -> Float[np.ndarray, "k 3"]:
+        """The same offsets by landmark; 0 for those without a place."""
+        found = np.zeros((len(self.names), 3))
+        for row, (group, side) in zip(self.placed, self.groups, strict=True):
+            found[row] = np.asarray(offsets[group]) * (side, 1, 1)
+        return found
+
+
+LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
+"""Multiples of the noise for landmarks on whose position annotators disagree."""
+
+
+def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
+    """(k,) the weight of a landmark's error in (0, 1], see `LESS_CERTAIN`."""
+    return np.asarray([1 / LESS_CERTAIN.get(kind_of(name), 1.0) for name in names], np.float32)
+
+
+def kind_of(name: str) -> str:
+    """The name without its side."""
+    return name.split("_", 1)[1] if name.startswith(("left_", "right_")) else name
 
 
 @checked_arguments
-def landmark_model(body: BodyModel, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> LandmarkModel:
+def landmark_model(
+    body: BodyModel, names: tuple[str, ...], places: tuple[Place, ...] = (), certainty: tuple[float, ...] = ()
+) -> LandmarkModel:
     """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
 
-    Arguments: places: of the landmarks that are elsewhere than the module says; ignored where the body lacks what they depend on.
+    Arguments: places: of the landmarks that may be elsewhere than the module says; ignored where the body lacks what they depend
+    on. certainty: of each, if it is known.
     Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
     """
     finder = _Finder(body)
@@ -130,6 +185,7 @@ def landmark_model(body: BodyModel, names: tuple[str, ...], places: tuple[Place,
         )
     vertices = sorted({source for found in sources for source in found if source >= 0})
     joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
+    kinds = sorted({kind_of(place.name) for place in placed})
     regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
     for row, name, found in zip(regressor, names, sources, strict=True):
         for source in found:
@@ -144,11 +200,14 @@ def landmark_model(body: BodyModel, names: tuple[str, ...], places: tuple[Place,
         joint_directions=_regressed(body, body.shape_directions),
         points=points,
         regressor=jnp.asarray(regressor),
+        certainty=jnp.asarray(certainty or usual_certainty(names), jnp.float32),
         names=names,
         known=known,
         parents=body.parents,
         joint_names=body.joint_names,
         movers=_movers(body.parents, regressor[:, :joints].any(0), np.asarray(points.weights)),
+        placed=tuple(names.index(place.name) for place in placed),
+        groups=tuple((kinds.index(kind_of(each.name)), -1 if each.name.startswith("right_") else 1) for each in placed),
     )
 
 

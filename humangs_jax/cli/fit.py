@@ -182,8 +182,7 @@ class Fit:
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.photos import capture_folder
             from humangs_jax.fitting.files import FIT_FILE, check_place, read_fit_record, write_fitted
-            from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_iterations import usual_config
+            from humangs_jax.fitting.refine import refine_capture, usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
@@ -221,9 +220,8 @@ class Fit:
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
+            from humangs_jax.fitting.scan_files import joints_from_views, read_joints, render_scan_views
             from humangs_jax.fitting.scan_fit import fit_scan
-            from humangs_jax.fitting.scan_reading import read_joints
-            from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
 
         assert scan.scan is not None  # `run` has checked it
         if only_views:
@@ -296,7 +294,7 @@ class Check:
         if record is not None or keypoints is not None:
             with stage("examining the fit"):
                 from humangs_jax.apps.check import fit_sheet
-                from humangs_jax.fitting.examination import examine_record
+                from humangs_jax.fitting.fit_capture import examine_record
 
                 examination, keypoints = examine_record(capture, record, keypoints)
                 fit_sheet(capture, keypoints, examination, sheet)

@@ -231,8 +231,7 @@ class Start:
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
-            from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_iterations import usual_config
+            from humangs_jax.fitting.refine import refine_capture, usual_config
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -255,7 +254,7 @@ class Start:
                 loose, tight = (
                     refine_capture(
                         capture,
-                        keypoints=keypoints,
+                        keypoints=fitted.record.keypoints,
                         config=usual_config(fitted=True, fixed_cameras=fixed, tight=tight, calibrated=calibrated),
                     )
                     for tight in (False, True)

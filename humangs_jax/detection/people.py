@@ -3,12 +3,16 @@
 The detector finds people from a third of its window's side on, so it looks at the whole photo and at windows of a half of its
 longer side that overlap by half, and, where nobody in these is large, of a quarter. What several windows find is one person if
 the landmarks agree.
+
+Masks have 256 pixels a side; a guided filter moves their edges to the photo's (He, Sun, Tang, Guided image filtering, 2013):
+within each window the mask is an affine function of the photo's colors, of a reduced photo (Fast guided filter, 2015).
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.detection.blazepose import (
@@ -20,6 +24,7 @@ from humangs_jax.detection.blazepose import (
     mask_at,
     mask_in_photo,
 )
+from humangs_jax.io.images import resized
 
 SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)
 """Sides of the windows over the photo's longer side; the second, most of all windows, where nobody is large."""
@@ -169,3 +174,47 @@ def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> flo
 
 def _inside(pixels, width, height):
     return ((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5)).all(-1)
+
+
+LEVEL = 0.4
+"""Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands and feet."""
+RADIUS, EPSILON = 2.0, 1e-4
+"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of colors that is no edge."""
+STEEPER = 2.0
+"""The filter's masks rise more slowly than true ones by this factor."""
+MOST = 2.0
+"""Pixels of the reduced photo for one of the detector's mask."""
+
+
+def sharpened(
+    mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
+) -> Float[np.ndarray, "h w"]:
+    """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the detector's mask."""
+    rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return mask
+    margin = int(np.ceil(2 * RADIUS * pixel))
+    window = tuple(slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns))
+    guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
+    height, width = own.shape
+    reduced = min(1.0, MOST / pixel)
+    size = max(1, round(reduced * width)), max(1, round(reduced * height))
+    small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)
+    slopes, offsets = _affine(*small, max(1, round(RADIUS * reduced * pixel)))
+    if reduced < 1:
+        slopes, offsets = resized(slopes, width, height), resized(offsets, width, height)
+    found, result = np.sum(slopes * guide, axis=-1) + offsets, np.zeros_like(mask)
+    result[window] = np.clip(STEEPER * (found - 0.5) + 0.5, 0, 1)
+    return result
+
+
+def _affine(guide, mask, radius):
+    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over the windows of each pixel."""
+    side = 2 * radius + 1
+    mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
+    colors, level = mean(guide), mean(mask)
+    together = mean(guide * mask[..., None]) - colors * level[..., None]
+    spread = mean(guide[..., :, None] * guide[..., None, :]) - colors[..., :, None] * colors[..., None, :]
+    slopes = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))[..., 0]
+    offsets = level - (slopes * colors).sum(-1)
+    return mean(slopes).astype(np.float32), mean(offsets).astype(np.float32)

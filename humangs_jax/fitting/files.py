@@ -7,6 +7,7 @@ fit.npz, the input of a fit to keypoints and how well its result is known:
     joint_std (m, j)         of the joints' positions, metres ("deviations" in files of earlier versions)
     determined (m, j)        share of the joints' rotations that the views determine
     shape_covariance (s, s)
+    places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights; not in files of earlier versions
 
 fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json (the report and where the scan
 is) and body_in_scan.ply.
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from humangs_jax.body.landmarks import usual_certainty
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
@@ -35,6 +37,8 @@ from humangs_jax.io.reading import reading, write_json
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
 KEYS = ("set", "names", "points", "confidences", "noise", "joint_std", "determined", "shape_covariance")
+OPTIONAL = ("places", "certainty")
+"""Keys that files of earlier versions do not have."""
 FORMER = {"joint_std": "deviations"}
 """Keys of earlier versions."""
 
@@ -64,12 +68,15 @@ class FitRecord:
 
 def write_fit_record(path: str | Path, record: FitRecord) -> None:
     """Write fit.npz, whole or not at all."""
+    kind = record.keypoints.set
     arrays = {
-        "set": np.asarray(record.keypoints.set.name),
+        "set": np.asarray(kind.name),
         "names": np.asarray(record.names),
         "points": record.keypoints.points.astype(np.float32),
         "confidences": record.keypoints.confidences.astype(np.float32),
         **{key: np.asarray(getattr(record, key), np.float32) for key in KEYS[4:]},
+        "places": kind.offsets.astype(np.float32),
+        "certainty": np.asarray(kind.certainty or usual_certainty(kind.names), np.float32),
     }
     write_npz(path, arrays, compressed=False)
 
@@ -94,6 +101,9 @@ def _read_fit_record(path):
         raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
     names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
     v, k = len(names), len(kind.names)
+    if set(OPTIONAL) <= set(values):
+        offsets = numbers(values["places"], path, "places", (k, 3))
+        kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
     points = numbers(values["points"], path, "points", (v, k, 2))
     confidences = numbers(values["confidences"], path, "confidences", (v, k))
     noise = numbers(values["noise"], path, "noise")

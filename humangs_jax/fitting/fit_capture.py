@@ -1,32 +1,276 @@
-"""From photos with cameras and keypoints to a capture with a body."""
+"""From photos with cameras and keypoints to a capture with a body: how well it is known, and how it agrees with the keypoints."""
 
 import dataclasses
 import functools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.landmarks import LandmarkModel, landmark_model
+from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyModel, without_expression
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.camera_errors import CameraError, find_camera_errors, mended
-from humangs_jax.fitting.examination import examine
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.landmark_fit import (
     FEW,
     MOTION_SCALE,
+    ROBUST_SCALES,
     STAGES,
     FitConfig,
     LandmarkFit,
     accelerations,
     fit_landmarks,
+    keypoint_problem,
 )
-from humangs_jax.fitting.report import FitReport, Stage
-from humangs_jax.fitting.residuals.keypoints import Observations, group_by_frame
-from humangs_jax.fitting.swaps import find_mirrored
-from humangs_jax.fitting.uncertainty import fit_uncertainty
+from humangs_jax.fitting.report import (
+    Change,
+    FitReport,
+    Stage,
+    ViewReport,
+    keypoint_warnings,
+    limit_violations,
+    undetermined_joints,
+)
+from humangs_jax.fitting.residuals.keypoints import (
+    PLACE_STD,
+    Observations,
+    found_noise,
+    frame_residuals,
+    group_by_frame,
+    keypoint_errors,
+)
+from humangs_jax.fitting.swaps import Swap, find_exchanged_hands, find_mirrored, find_swaps
 
+UNSEEN = 1e-8
+"""Least information about position and orientation; keeps the inverse finite for frames without keypoints."""
+
+
+@pytree_dataclass
+class Uncertainty:
+    """The uncertainty of a fit of m frames (numpy on the host).
+
+    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j) share of the prior's variance of
+    a joint's rotation, mean over axes, that the views remove: 1 all, 0 nothing, as for joints that no keypoint depends on.
+    shape_covariance: (s, s).
+    """
+
+    joint_covariances: Float[np.ndarray, "m j 3 3"]
+    determined: Float[np.ndarray, "m j"]
+    shape_covariance: Float[np.ndarray, "s s"]
+
+    @property
+    def joint_std(self) -> Float[np.ndarray, "m j"]:
+        """(m, j) metres: root mean square of the expected distance from the true joint."""
+        return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
+
+
+def fit_uncertainty(model: LandmarkModel, observations: Observations, fit: LandmarkFit) -> Uncertainty:
+    """The covariance of a fit to these observations, in float64.
+
+    Raises: ValueError if the fit has a different number of frames than the observations.
+    """
+    m = len(observations.noise)
+    if len(fit.noise) != m:
+        raise ValueError(f"a fit of {len(fit.noise)} frames, but observations of {m}")
+    model = replace(model, certainty=fit.certainty)
+    by_pose, by_shape, joints_by_pose, joints_by_shape = (
+        np.asarray(x, np.float64) for x in _derivatives(model, replace(observations, noise=fit.noise), fit)
+    )
+    information = np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
+    coupling = np.einsum("mra,mrs->mas", by_pose, by_shape)
+    own = np.linalg.inv(information)
+    carried = own @ coupling
+    shapes = by_shape.shape[-1]
+    shape_information = np.einsum("mrs,mrt->st", by_shape, by_shape) - np.einsum("mas,mat->st", coupling, carried)
+    shape_covariance = np.linalg.inv(shape_information + np.eye(shapes))
+    poses = own + carried @ shape_covariance @ carried.swapaxes(-1, -2)
+    cross = -carried @ shape_covariance
+    mixed = np.einsum("mjap,mps,mjbs->mjab", joints_by_pose, cross, joints_by_shape)
+    covariances = (
+        np.einsum("mjap,mpq,mjbq->mjab", joints_by_pose, poses, joints_by_pose)
+        + mixed
+        + mixed.swapaxes(-1, -2)
+        + np.einsum("mjas,st,mjbt->mjab", joints_by_shape, shape_covariance, joints_by_shape)
+    )
+    return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape_covariance)
+
+
+def _determined(problem, poses):
+    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
+    joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
+    left = variances[:, 6:].reshape(len(poses), len(joints), 3)
+    std = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
+    determined = np.zeros((len(poses), len(problem.prior.std)))
+    determined[:, joints] = 1 - np.clip(left.mean(-1), 0, 1)
+    determined[:, 0] = 1 - np.clip((std / np.pi).max(-1), 0, 1)
+    return determined
+
+
+@jax.jit
+def _derivatives(model, observations, fit):
+    """Derivatives of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
+    problem = keypoint_problem(model)
+
+    def both(seen, vector, betas):
+        pose = {"global_orient": vector[:3], "transl": vector[3:6], "body_pose": vector[6:].reshape(-1, 3)}
+        state = replace(fit.state, betas=betas, **pose)
+        found = frame_residuals(problem, seen, state, ROBUST_SCALES[-1])
+        found.pop("shape")
+        positions = problem.landmarks_and_joints(state)[1]
+        return jnp.concatenate([leaf.ravel() for leaf in found.values()]), positions
+
+    def frame(seen, own):
+        vector = jnp.concatenate([own.global_orient, own.transl, own.body_pose.ravel()])
+        (by_pose, by_shape), (joints_by_pose, joints_by_shape) = jax.jacfwd(both, argnums=(1, 2))(
+            seen, vector, own.betas
+        )
+        return by_pose, by_shape, joints_by_pose, joints_by_shape
+
+    m = len(observations.noise)
+    own = replace(fit.state, betas=jnp.broadcast_to(fit.state.betas, (m, *fit.state.betas.shape)), places=None)
+    return jax.lax.map(lambda x: frame(*x), (observations, own))
+
+
+OUTLIER = 5.0
+"""Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the last stage of a fit."""
+
+
+REMEDIES = "`humangs fit` turns it back", "give its photos to other frames"
+"""Of cameras that are turned, and late."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Examination:
+    """The report on a body and keypoints, and the arrays behind it, of v views, m frames and k keypoints.
+
+    frames: (m,) median error, pixels, NaN where no view has keypoints. noise: (m,) std of the keypoints, pixels. landmarks:
+    (v, k, 2) of the body, pixels. compared, outliers: (v, k).
+    """
+
+    report: FitReport
+    frames: Float[np.ndarray, " m"]
+    noise: Float[np.ndarray, " m"]
+    landmarks: Float[np.ndarray, "v k 2"]
+    compared: Bool[np.ndarray, "v k"]
+    outliers: Bool[np.ndarray, "v k"]
+
+
+def examine(
+    capture: Capture,
+    keypoints: Keypoints,
+    *,
+    joint_std: Float[np.ndarray, "m j"] | None = None,
+    determined: Float[np.ndarray, "m j"] | None = None,
+    noise: Float[np.ndarray, " m"] | None = None,
+    mirrored: tuple[Swap, ...] = (),
+) -> Examination:
+    """Compare the body of a capture with keypoints of its views, in the order of the views.
+
+    Arguments: joint_std, determined: of joints, metres and shares, see `fit_uncertainty`. noise: pixels, as the fit found it;
+    default: from the median error. mirrored: result of `find_mirrored`.
+    Raises: ValueError if the number of views differs, or the body has none of the landmarks.
+    """
+    if len(keypoints.points) != capture.view_count:
+        raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
+    observations, views = group_by_frame(capture, keypoints)
+    expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
+    kind = keypoints.set
+    model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
+    errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))
+    compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
+    lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
+    frames = np.asarray([_quantile(own, 0.5) for own in lengths])
+    noise = (
+        noise[: len(views)]
+        if noise is not None
+        else np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
+    )
+    outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
+
+    frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
+    by_view = lambda values: values[frame_of, slot_of]
+    numbers = zip(capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True)
+    rows = tuple(_view_report(*own) for own in numbers)
+    violations = limit_violations(capture.body.joint_names, poses)
+    known = [None if values is None else values[: len(views)] for values in (joint_std, determined)]
+    swaps = (*mirrored, *find_swaps(observations, keypoints.set, views, capture.names))
+    swaps += find_exchanged_hands(keypoints, capture.names)
+    report = FitReport(
+        fitted="keypoints",
+        errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
+        views=rows,
+        violations=violations,
+        swaps=swaps,
+        undetermined=undetermined_joints(capture.body.joint_names, compared.any((1, 2)), *known),
+        notes=_worst_frame(frames),
+        warnings=(
+            *(
+                f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}"
+                for error in find_camera_errors(capture, keypoints)
+            ),
+            *keypoint_warnings(rows, expected, violations, swaps),
+        ),
+    )
+    landmarks = by_view(errors + np.asarray(observations.points))
+    return Examination(report, frames, noise, landmarks, by_view(compared), by_view(outliers))
+
+
+def examine_record(
+    capture: Capture, record: FitRecord | None, keypoints: Keypoints | None = None
+) -> tuple[Examination, Keypoints]:
+    """Examine a capture with the record of its fit, or with other keypoints; also returns the keypoints, ordered by view.
+
+    Raises: ValueError if both are None, if the record is of other views or of fewer frames, or as `examine` does.
+    """
+    if keypoints is not None:
+        return examine(capture, keypoints), keypoints
+    if record is None:
+        raise ValueError("neither keypoints nor the record of a fit to examine the body with")
+    keypoints = record.of_views(capture.names)
+    if len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(capture.body.joint_names):
+        raise ValueError(
+            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
+            f"{capture.frames.max() + 1} and {len(capture.body.joint_names)}: fit it again"
+        )
+    known = {name: getattr(record, name) for name in ("joint_std", "determined", "noise")}
+    return examine(capture, keypoints, **known), keypoints
+
+
+@jax.jit
+def _errors(model, betas, poses, observations):
+    """(m, c, k, 2) landmarks less keypoints, pixels."""
+    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
+    return jax.vmap(keypoint_errors)(observations, landmarks)
+
+
+def _worst_frame(frames):
+    known = np.flatnonzero(np.isfinite(frames))
+    if len(frames) < 2 or not len(known):
+        return ()
+    worst = known[np.argmax(frames[known])]
+    middle = np.median(frames[known])
+    return (f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",)
+
+
+def _view_report(name, frame, lengths, outliers):
+    count = int(np.isfinite(lengths).sum())
+    share = float(outliers.sum() / max(count, 1))
+    return ViewReport(name, frame, count, _quantile(lengths, 0.5), _quantile(lengths, 0.9), share)
+
+
+def _quantile(values, share):
+    """A quantile of the values that are not NaN; NaN if all are."""
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, share)) if known.size else float("nan")
+
+
+FAR_MM = 10.0
+"""Millimetres between places of landmarks that are worth a line."""
 FAR = 4.0
 """A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of half their distance."""
 
@@ -59,7 +303,8 @@ class FittedCapture:
         stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
         warnings = (*report.warnings, *_blind_frames(seen, smooth), *_motion_warnings(fit, self.config.smoothness))
         turned = (f"{error}: turned back" for error in self.camera_errors)
-        return dataclasses.replace(report, stages=stages, notes=(*report.notes, *turned), warnings=warnings)
+        notes = (*report.notes, *_places(self.model, fit), *turned)
+        return dataclasses.replace(report, stages=stages, notes=notes, warnings=warnings)
 
 
 def fit_photos(
@@ -87,16 +332,32 @@ def fit_photos(
         )
     errors = () if fixed_cameras else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
     photos = mended(photos, errors) if errors else photos
-    model = landmark_model(without_expression(body), keypoints.set.names, keypoints.set.places)
+    kind = keypoints.set
+    model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
     fit = fit_landmarks(model, observations, config)
-    found = fit_uncertainty(model, observations, fit, config)
+    found = fit_uncertainty(model, observations, fit)
     capture = Capture(**vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
+    moved = np.zeros((len(kind.names), 3))
+    if fit.state.places is not None:
+        moved = model.by_landmark(PLACE_STD * fit.state.places)
+    keypoints = dataclasses.replace(keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty)))
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
     return FittedCapture(capture, record, fit, model, observations, config, errors)
+
+
+def _places(model, fit):
+    """A line about landmarks that the detector sees elsewhere, if the fit looked for them."""
+    if fit.state.places is None:
+        return
+    moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
+    kinds = {group: kind_of(model.names[row]) for row, (group, _) in zip(model.placed, model.groups, strict=True)}
+    far = [f"{kinds[group]} {moved[group]:.0f} mm" for group in np.argsort(-moved)[:3] if moved[group] > FAR_MM]
+    if far:
+        yield f"the detector sees landmarks beside where the body has them, which is undone: {', '.join(far)}"
 
 
 def _blind_frames(seen, smooth):

@@ -4,7 +4,8 @@
     points  body joints and shape against triangulated points; skipped by frames without any
     body    the same against the keypoints of every view
     hands   all joints that a keypoint depends on, with a smaller robust scale
-    person  all frames at once: one shape, and the noise that was found
+    person  all frames at once: one shape, the noise that was found, of each landmark too, and, of several frames that several
+            views show, the places at which the detector sees its landmarks
     motion  where requested, the same with smooth motion, which is expected weakly first: see `smooth_motion`
 
 The first four are one program that runs with other weights and other free unknowns, because compilation dominates the time.
@@ -26,7 +27,9 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.keypoints.sets import mirrored_name
 from humangs_jax.fitting.residuals.keypoints import (
+    RAYLEIGH_MEDIAN,
     KeypointProblem,
     Observations,
     Targets,
@@ -38,7 +41,6 @@ from humangs_jax.fitting.residuals.keypoints import (
     keypoint_residuals,
     trunk_weights,
 )
-from humangs_jax.fitting.residuals.priors import pose_prior
 from humangs_jax.fitting.solve import Outcome, half_squares, robust, solve
 from humangs_jax.fitting.state import (
     FREE,
@@ -46,6 +48,7 @@ from humangs_jax.fitting.state import (
     betas_of,
     frame_axes,
     pose_of,
+    pose_prior,
     state_of,
     usual_origin,
     zero_state,
@@ -54,27 +57,29 @@ from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
+PLACED_FRAMES = 4
+"""From so many frames on a fit finds where the detector sees its landmarks: fewer say too little about shape and places both."""
+USUAL_COUNT, LEAST_RATIO = 16, 0.5
+"""Keypoints that what is usual counts for, and its least share, where the noise of a landmark is found."""
 STAGES = ("rigid", "points", "body", "hands")
+ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
+"""Of keypoint errors in these stages and in that of the person, standard deviations."""
+STARTS = (4, 2)
+"""Orientations that are followed, for one view and for several."""
+TOLERANCE = 3e-4
+"""Of the unknowns, which are of unit size."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
-    """Static settings of a fit.
+    """Static settings of a fit."""
 
-    pose_weight, shape_weight: of the priors; 1: a standard deviation of them counts like one of a keypoint. robust_scales: of
-    keypoint errors in the stages rigid, points, body, hands and person, standard deviations. smoothness: expected acceleration of
-    joints, metres per frame squared; 0: frames are independent. steps, person_steps: of the solver in a stage, at most. starts:
-    orientations that are followed, for one view and for several. tolerance: of the unknowns, which are of unit size.
-    """
-
-    pose_weight: float = 1.0
-    shape_weight: float = 1.0
-    robust_scales: tuple[float, float, float, float, float] = (30.0, 15.0, 15.0, 10.0, 5.0)
     smoothness: float = 0.0
+    """Expected acceleration of joints, metres per frame squared; 0: frames are independent."""
     steps: int = 150
+    """Of the solver in a stage of one frame, at most."""
     person_steps: int = 150
-    starts: tuple[int, int] = (4, 2)
-    tolerance: float = 3e-4
+    """Of the solver for all frames together, at most."""
 
 
 @pytree_dataclass
@@ -84,6 +89,7 @@ class LandmarkFit:
     noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin.
     outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames, and "motion", one for
     each of `MOTION_LEVELS`. smoothness: () the acceleration that the motion was held to, metres per frame squared; 0: to none.
+    certainty: (k,) of the landmarks.
     """
 
     betas: Float[Array, " s"]
@@ -94,6 +100,7 @@ class LandmarkFit:
     state: FitState
     outcomes: dict[str, Outcome]
     smoothness: Float[Array, ""]
+    certainty: Float[Array, " k"]
 
 
 @checked_arguments
@@ -110,20 +117,25 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitC
 @functools.partial(jax.jit, static_argnames="config")
 def _fit_frames(model, observations, config):
     """All stages but the motion."""
-    problem = keypoint_problem(model, config)
+    problem = keypoint_problem(model)
     states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
-    start = replace(states, betas=jnp.median(states.betas, axis=0))
-    residuals = lambda state: _person_residuals(problem, observations, state, config)
-    state, outcomes["person"] = solve(residuals, start, config.person_steps, method="lbfgs", tolerance=config.tolerance)
+    model = replace(model, certainty=_certainty_found(problem, observations, states))
+    problem = keypoint_problem(model)
+    groups = len({group for group, _ in model.groups})
+    many = groups and observations.points.shape[0] >= PLACED_FRAMES and observations.points.shape[1] > 1
+    places = jnp.zeros((groups, 3)) if many else None
+    start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
+    residuals = lambda state: _person_residuals(problem, observations, state)
+    state, outcomes["person"] = solve(residuals, start, config.person_steps, method="lbfgs", tolerance=TOLERANCE)
     return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
 
 
 def _result(problem, noise, state, outcomes, smoothness):
     betas = betas_of(problem.origin, state)
     poses = _poses(problem, state)
-    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model, betas, pose))(poses)
-    return LandmarkFit(betas, poses, landmarks, joints, noise, state, outcomes, smoothness)
+    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(poses)
+    return LandmarkFit(betas, poses, landmarks, joints, noise, state, outcomes, smoothness, problem.model.certainty)
 
 
 def _poses(problem, state):
@@ -131,20 +143,20 @@ def _poses(problem, state):
     return jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
 
 
-def keypoint_problem(model: LandmarkModel, config: FitConfig = FitConfig()) -> KeypointProblem:
+def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
     """The problem in which every joint is free that moves a landmark; the others rest in the usual pose."""
     prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
     origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
-    return KeypointProblem(model, prior, origin, config.pose_weight, config.shape_weight)
+    return KeypointProblem(model, prior, origin)
 
 
 def _fit_frame(problem, seen, config):
     """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
     several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
-    starts = _rigid_starts(problem, seen, points, counts, config.starts[several])
+    starts = _rigid_starts(problem, seen, points, counts, STARTS[several])
     targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
-    stages = _stages(problem, config, targets)
+    stages = _stages(problem, targets)
     states, outcomes = jax.vmap(lambda start: _run_stages(problem, seen, start, stages, config))(starts)
     best = jnp.argmin(outcomes.after[:, -1])
     state, outcomes = jax.tree.map(lambda leaf: leaf[best], (states, outcomes))
@@ -249,7 +261,7 @@ BODY = (*BODY_NAMES, "jaw")
 """Joints that move before the hands do."""
 
 
-def _stages(problem, config, targets):
+def _stages(problem, targets):
     """A batch of the four stages."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
@@ -264,7 +276,7 @@ def _stages(problem, config, targets):
     )
     triangulated = jnp.any(targets.known)
     in_space = lambda share: replace(targets, known=targets.known * share)
-    scale = lambda stage: jnp.asarray(config.robust_scales[stage])
+    scale = lambda stage: jnp.asarray(ROBUST_SCALES[stage])
     stages = [
         _Stage(trunk, in_space(0.0), scale(0), free(False, False)),
         _Stage(jnp.where(triangulated, none, ones), in_space(1.0), scale(1), free(True, body)),
@@ -280,7 +292,7 @@ def _run_stages(problem, seen, start, stages, config):
     def run(state, stage):
         weighted = replace(seen, confidences=seen.confidences * stage.views)
         residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
-        return solve(residuals, state, config.steps, method="lbfgs", tolerance=config.tolerance, free=stage.free)
+        return solve(residuals, state, config.steps, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
 
     return jax.lax.scan(run, start, stages)
 
@@ -290,17 +302,39 @@ def _noise_found(problem, observations, states):
 
     def of_frame(seen, state):
         lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)
-        median = jnp.nanmedian(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan))
-        return found_noise(median, seen.noise)
+        return found_noise(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise)
 
     return jax.vmap(of_frame)(observations, states)
 
 
-def _person_residuals(problem, observations, state, config):
+def _certainty_found(problem, observations, states):
+    """(k,) of landmarks, from the errors of the first stages in the frames that several views show: a robust noise of each pair,
+    over that of all. The fewer there are, the nearer to the usual.
+    """
+    model, pair = problem.model, np.asarray([problem.model.names.index(mirrored_name(n)) for n in problem.model.names])
+
+    def lengths(seen, state):
+        errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
+        known = (seen.confidences > 0) & (problem.known > 0)
+        shared = known & (jnp.sum(known, axis=0) > 1)
+        return jnp.where(shared, jnp.linalg.norm(errors, axis=-1), jnp.nan)
+
+    found = jax.vmap(lengths)(observations, states)
+    found = jnp.stack([found, found[..., pair]])
+    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / (1 + (pair != np.arange(len(pair))))
+    ratio = jnp.nan_to_num(jnp.nanmedian(found, axis=(0, 1, 2)) / RAYLEIGH_MEDIAN, nan=1.0)
+    usual = 1 / model.certainty
+    variance = (USUAL_COUNT * usual**2 + count * ratio**2) / (USUAL_COUNT + count)
+    return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
+
+
+def _person_residuals(problem, observations, state):
     """All frames at once with one shape."""
-    of_frame = lambda seen, own: frame_residuals(problem, seen, own, config.robust_scales[-1])
+    of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
-    found["shape"] = problem.shape_weight * state.betas  # once, whatever the number of frames
+    found["shape"] = state.betas  # once, whatever the number of frames
+    if state.places is not None:
+        found["places"] = state.places
     return found
 
 
@@ -326,14 +360,14 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
     exceeds it by on average, because a fit with p unknowns takes up p of the squared normal errors and half of them are the cost.
     If no level does, the fit itself.
     """
-    problem = keypoint_problem(model, config)
+    problem = keypoint_problem(replace(model, certainty=fit.certainty))
     seen = replace(observations, noise=fit.noise)
     axes = frame_axes(fit.state)
 
     def costs(state):
         """(m,) of the keypoints of each frame."""
         landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(state)
-        errors = lambda each, points: half_squares(keypoint_residuals(model, each, points, config.robust_scales[-1]))
+        errors = lambda each, points: half_squares(keypoint_residuals(model, each, points, ROBUST_SCALES[-1]))
         return jax.vmap(errors)(seen, landmarks)
 
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
@@ -345,9 +379,9 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
         def residuals(y):
             joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(axes,))(y)
             motion = robust(accelerations(joints) / std, MOTION_SCALE)
-            return _person_residuals(problem, seen, y, config) | {"motion": motion}
+            return _person_residuals(problem, seen, y) | {"motion": motion}
 
-        state, outcome = solve(residuals, state, config.person_steps, method="lbfgs", tolerance=config.tolerance)
+        state, outcome = solve(residuals, state, config.person_steps, method="lbfgs", tolerance=TOLERANCE)
         good = jnp.all(costs(state) <= limit)
         kept, smoothness = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, smoothness))
         return (state, kept, smoothness), outcome

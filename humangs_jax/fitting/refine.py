@@ -1,22 +1,385 @@
-"""Cameras, shape and poses refined against silhouettes and keypoints (`refine_iterations`): kept only if the score is better."""
+"""Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is better.
+
+Iterations are similar to iterated closest points: each draws the body, matches its silhouette with the mask's, and moves
+cameras, shape and poses by a few steps of damped least squares. The reach falls from one to the next. `StateStd` is a Gaussian
+prior around the start; without it cameras and people that move together would look the same, and silhouettes hardly show twists.
+"""
 
 import dataclasses
 import functools
+import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body, without_expression
+from humangs_jax.body.skinning import EXACT, SurfacePoints, pose_points
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.refine_iterations import (
-    CaptureRefineConfig,
-    Scene,
-    moved_capture,
-)
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
+from humangs_jax.fitting.residuals.keypoints import (
+    NEAR,
+    Observations,
+    found_noise,
+    keypoint_residuals,
+    make_observations,
+)
+from humangs_jax.fitting.residuals.silhouettes import (
+    BodyView,
+    MaskView,
+    Matches,
+    body_boundary,
+    boundary_points,
+    distances,
+    mask_boundary,
+    match,
+    mesh_edges,
+    silhouette_residuals,
+    view_body,
+)
+from humangs_jax.fitting.solve import NORMAL_MAD, Outcome, solve
+from humangs_jax.fitting.state import (
+    FitState,
+    Origin,
+    StateStd,
+    betas_of,
+    camera_origin,
+    cameras_of,
+    clothing_thickness,
+    pose_of,
+    segments,
+    with_cameras,
+    zero_state,
+)
+from humangs_jax.fitting.triangulation import reprojection_errors
 from humangs_jax.geometry import quaternion
-from humangs_jax.geometry.transform import EXACT
+from humangs_jax.geometry.camera import Camera
+
+LEAST_NOISE = 0.7
+"""Pixels: silhouettes of masks are no better."""
+LM_UNKNOWNS = 400
+"""With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns."""
+PATIENCE = 6
+"""Steps of L-BFGS for one of least squares."""
+KEYPOINT_SCALE = 5.0
+"""Robust scale of keypoints, standard deviations."""
+BARE = 5.0
+"""Clothes have no negative thickness: it counts this much more than a positive one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureRefineConfig:
+    """Static settings of a refinement.
+
+    std: how far off the start is expected to be. shared_focal: focal lengths that start equal stay equal. coefficients: of the
+    shape, where the capture has fewer. fixed_cameras: only shape and poses move. iterations: number of matchings; steps: of the
+    solver in each. points: of a silhouette.
+    independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
+    the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
+    the mask. longest_side: larger photos are shrunk to this many pixels.
+    keypoints_worse: a result whose keypoints' error is more than this multiple of the
+    start's is not kept; a fit to them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    """
+
+    std: StateStd = dataclasses.field(default_factory=StateStd)
+    shared_focal: bool = True
+    coefficients: int = 10
+    fixed_cameras: bool = False
+    iterations: int = 10
+    steps: int = 4
+    points: int = 300
+    independent: float = 30.0
+    reach: tuple[float, float] = (0.08, 0.015)
+    robust_scales: tuple[float, float] = (1.0, 0.5)
+    longest_side: int = 512
+    keypoints_worse: float = 1.3
+
+
+FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
+"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its keypoints hold the joints where
+clothes would pull them away."""
+FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
+"""The same with cameras that were found from the person."""
+SKIN, TIGHT = 0.001, 0.015
+"""Metres, for `StateStd.clothing`: masks of somebody without clothes, and in tight ones."""
+
+
+def usual_config(
+    fitted: bool, *, fixed_cameras: bool = False, bare: bool = False, tight: bool = False, calibrated: bool = True
+) -> CaptureRefineConfig:
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the body is to fill the
+    masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
+    """
+    config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
+    if fitted:
+        config = dataclasses.replace(config, std=FITTED if calibrated else FROM_PERSON, independent=100.0)
+    if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
+        config = dataclasses.replace(config, keypoints_worse=math.inf)
+    if tight:
+        config = dataclasses.replace(
+            config, std=dataclasses.replace(config.std, clothing=TIGHT, betas=2.0, body_pose=10.0)
+        )
+    if bare:
+        std = dataclasses.replace(config.std, clothing=SKIN)
+        config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))
+    return config
+
+
+# The state of a capture ----------------------------------------------------------------------------------------------
+
+
+def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
+    """The origin of a refinement. cameras: of the views, for images of any size."""
+    body = capture.body
+    named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
+    joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
+    wanted = max(len(capture.betas), min(config.coefficients, without_expression(body).shape_directions.shape[-1]))
+    return Origin(
+        betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
+        pose=capture.poses,
+        body_pose_std=jnp.full((len(joints), 3), np.radians(config.std.body_pose), jnp.float32),
+        cameras=camera_origin(cameras, capture.frames, config.shared_focal),
+        segment=jnp.asarray(segments(body.parents, joints)),
+        joints=joints,
+        std=config.std,
+    )
+
+
+def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
+    """Zeros for what a refinement moves."""
+    state = zero_state(origin)
+    return replace(state, cameras=None) if config.fixed_cameras else state
+
+
+def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
+    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images."""
+    (K, cam_from_world), betas, poses = _moved(with_cameras(origin, capture.cameras), state)
+    cameras = replace(capture.cameras, K=K, cam_from_world=cam_from_world)
+    return dataclasses.replace(capture, cameras=cameras, betas=np.asarray(betas), poses=poses)
+
+
+@jax.jit
+def _moved(origin, state):
+    return cameras_of(origin, state), betas_of(origin, state), pose_of(origin, state)
+
+
+# Equations -----------------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class Evidence:
+    """What v views show. points: of the body's silhouette, and matches: their equations, batches of v. noise: () pixels; scales:
+    (2,) robust scales, pixels, outwards and inwards. keypoints: a batch of v, each with one view (c = 1), or None.
+    """
+
+    points: SurfacePoints
+    matches: Matches
+    noise: Float[Array, ""]
+    scales: Float[Array, "2"]
+    keypoints: Observations | None
+
+
+def evidence_residuals(
+    model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
+) -> dict[str, Float[Array, "..."]]:
+    """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v, 1, k, 2)."""
+    K, cam_from_world = cameras_of(origin, state)
+    betas, poses, frame = betas_of(origin, state), pose_of(origin, state), origin.views.frame
+    transforms, joints = jax.vmap(lambda pose: pose_joints(model, betas, pose))(poses)
+    features = jax.vmap(pose_features)(poses.rotations)
+
+    def silhouette(points, matches, frame, K, matrix):
+        posed = pose_points(points, betas, features[frame], transforms[frame])
+        seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
+        focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
+        clothes = clothing_thickness(origin, state, points.weights) * focal.mean() / depth[:, 0]
+        pixels, scales = seen[:, :2] / depth * focal + K[:2, 2], (evidence.scales[0], evidence.scales[1])
+        return silhouette_residuals(matches, pixels, clothes, evidence.noise, scales, independent)
+
+    parts = {"silhouettes": jax.vmap(silhouette)(evidence.points, evidence.matches, frame, K, cam_from_world)}
+    if evidence.keypoints is not None:
+
+        def landmarks(features, transforms, joints):
+            return landmarks_from(model, joints, pose_points(model.points, betas, features, transforms))
+
+        seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
+        points = jax.vmap(landmarks)(features, transforms, joints)[frame]
+        compare = lambda own, points: keypoint_residuals(model, own, points, KEYPOINT_SCALE)
+        parts["keypoints"] = jax.vmap(compare)(seen, points)
+    return parts
+
+
+@functools.partial(jax.jit, static_argnames=("independent", "steps"))
+def solve_round(
+    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float, steps: int
+) -> tuple[FitState, Outcome]:
+    """The state after at most `steps` steps with fixed matches."""
+
+    def residuals(y):
+        clothing = jnp.where(y.clothing < 0, BARE * y.clothing, y.clothing)
+        return evidence_residuals(model, origin, y, evidence, independent), replace(y, clothing=clothing)
+
+    if sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS:
+        return solve(residuals, state, PATIENCE * steps, method="lbfgs")
+    return solve(residuals, state, steps, method="lm")
+
+
+# Rounds --------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Score:
+    """ious: (v,) of silhouettes, NaN without a mask. iou: their mean; None without any mask. keypoints: median error, pixels;
+    None without. loss: 1 - iou plus the keypoints' error as a share of the person's height.
+    """
+
+    ious: Float[np.ndarray, " v"]
+    iou: float | None
+    keypoints: float | None
+    loss: float
+
+
+class Scene:
+    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and the origin."""
+
+    def __init__(self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig) -> None:
+        self.capture, self.config = capture, config
+        small = max(capture.images.shape[1:3]) <= config.longest_side
+        looked_at = capture if small else capture.resized(config.longest_side)
+        empty = np.zeros(looked_at.images.shape[:3], np.float32)
+        self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
+        self.faces = np.asarray(capture.body.faces)
+        self.edges = mesh_edges(self.faces)
+        self.views = [MaskView(mask, mask_boundary(mask, config.points)) for mask in self.masks]
+        kind = None if keypoints is None else keypoints.set
+        known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
+        self.model = landmark_model(capture.body, *known)
+        self.scale = self.cameras.width / capture.cameras.width
+        self.keypoints = None if keypoints is None else _observations(capture.cameras, keypoints, 1.0)
+        self.observations = None if keypoints is None else _observations(self.cameras, keypoints, self.scale)
+        self.height = _person_height(self.masks, self.observations)
+        self.origin = capture_origin(capture, self.cameras, config)
+
+    def run(self) -> tuple[FitState, Outcome, float]:
+        """The state after all iterations, what the solver did in each (a batch), and the largest move of the last round, in
+        expected standard deviations.
+        """
+        config, state, outcomes, move = self.config, start_state(self.origin, self.config), [], 0.0
+        first, last = config.reach
+        for turn in range(config.iterations):
+            evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)))
+            before = state
+            state, outcome = solve_round(self.model, self.origin, evidence, state, config.independent, config.steps)
+            outcomes.append(outcome)
+            moves = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before)
+            move = max(jax.tree.leaves(moves))
+        return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcomes), move
+
+    def look(self, state: FitState, reach: float) -> Evidence:
+        """What the views show, matched within `reach` pixels of the body in this state."""
+        count = self.config.points
+        moved = moved_capture(self.capture, self.origin, state)
+        boundaries = [body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
+        matches = [match(boundary, view, reach, count) for boundary, view in zip(boundaries, self.views, strict=True)]
+        return Evidence(
+            points=boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
+            matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
+            noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
+            scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
+            keypoints=self._keypoints(moved),
+        )
+
+    def _keypoints(self, capture: Capture) -> Observations | None:
+        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence against the masks."""
+        if self.observations is None:
+            return None
+        errors = jnp.asarray(self._errors(capture) * self.scale, jnp.float32)
+        return replace(self.observations, noise=found_noise(errors, self.observations.noise))
+
+    def _errors(self, capture: Capture) -> Float[np.ndarray, "v k"]:
+        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
+        assert self.keypoints is not None
+        cameras = {name: getattr(capture.cameras, name)[:, None] for name in ("K", "cam_from_world")}
+        seen = replace(self.keypoints, **cameras)
+        errors = _keypoint_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
+        known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
+        return np.where(known, np.asarray(errors), np.nan)[:, 0]
+
+    def body_views(self, capture: Capture) -> list[BodyView]:
+        """The body of a capture of these photos in every view."""
+        cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
+        vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
+        faces = capture.body.faces
+        return [view_body(vertices[int(frame)], faces, cameras[i]) for i, frame in enumerate(capture.frames)]
+
+    def score(self, capture: Capture) -> Score:
+        """How well the body of a capture of these photos agrees with masks and keypoints."""
+        pairs = zip(self.body_views(capture), self.masks, strict=True)
+        ious = np.asarray([overlap(view.covered, mask) for view, mask in pairs])
+        iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
+        loss = 0.0 if iou is None else 1 - iou
+        if self.keypoints is not None:
+            errors = self._errors(capture)
+            if np.isfinite(errors).any():
+                keypoints = float(np.nanmedian(errors))
+                loss += keypoints * self.scale / self.height
+        return Score(ious, iou, keypoints, loss)
+
+
+def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) -> float:
+    """Intersection over union of a body and a mask; NaN if the mask is empty."""
+    person = mask > 0.5
+    return float((covered & person).sum() / (covered | person).sum()) if person.any() else float("nan")
+
+
+@jax.jit
+def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose) -> Float[jax.Array, "m n 3"]:
+    """Vertices of a person in a batch of m poses, metres."""
+    rest = shape_body(body, betas)
+    return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
+
+
+@jax.jit
+def _keypoint_errors(model, betas, poses, seen, frames):
+    """(v, 1, k) pixels."""
+    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
+    return jax.vmap(reprojection_errors)(seen, landmarks[frames])
+
+
+def _noise(boundaries, matches):
+    """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
+    off = [
+        np.asarray(distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
+        for boundary, m in zip(boundaries, matches, strict=True)
+        if len(boundary.positions)
+    ]
+    off = np.concatenate([np.zeros(0), *off])
+    return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0
+
+
+def _person_height(masks, observations):
+    """Height of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
+    sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
+    if not sizes and observations is not None:
+        pairs = zip(np.asarray(observations.points)[:, 0], np.asarray(observations.confidences)[:, 0] > 0, strict=True)
+        sizes = [np.ptp(points[seen], axis=0).max() for points, seen in pairs if seen.any()]
+    return float(np.median(sizes)) if sizes else float("nan")
+
+
+def _observations(cameras, keypoints, scale):
+    """Keypoints of images of another scale: a batch of views, each with one view (c = 1)."""
+    points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
+    arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
+    seen = make_observations(*(x[None] for x in arrays))
+    by_view = {name: getattr(seen, name)[0][:, None] for name in ("points", "confidences", "K", "cam_from_world")}
+    return replace(seen, **by_view, noise=jnp.broadcast_to(seen.noise, (len(points),)))
+
 
 LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
 """Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of clothes are fitted a little better

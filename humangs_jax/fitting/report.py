@@ -14,8 +14,8 @@ from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.progress import text_table
-from humangs_jax.fitting.residuals.priors import pose_prior, violations
 from humangs_jax.fitting.solve import Outcome
+from humangs_jax.fitting.state import pose_prior, violations
 from humangs_jax.fitting.swaps import Swap
 
 ROWS = 24

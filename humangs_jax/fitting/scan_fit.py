@@ -20,9 +20,10 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.fitting.report import Change, FitReport, Stage, limit_violations
 from humangs_jax.fitting.residuals.scan import Given, ScanMatches, Target, Tolerances, body_surface, scan_problem
-from humangs_jax.fitting.scan_reading import SCAN_LANDMARKS, Scan, checked_joints, read_scan
+from humangs_jax.fitting.scan_files import SCAN_LANDMARKS, Scan, checked_joints, read_scan
 from humangs_jax.fitting.scan_search import (
     COARSE,
+    SHAPES,
     Round,
     ScanFitConfig,
     improve,
@@ -54,6 +55,10 @@ LITTLE = 0.6
 """A smaller share of the scan near the body puts the fit in doubt. Wide skirts and long hair leave 0.7."""
 UPRIGHT = np.cos(np.radians(25.0))
 """Cosine between an axis of the scan and the person's axis from which the former is up."""
+SKIN, CLOTH, JOINT_STD = 0.004, 0.015, 0.01
+"""Metres: std of a scan on bare skin, and of a body that pokes out of clothes; of clothes off the skin; of given joints."""
+EFFECTIVE = (1500.0, 300.0)
+"""Number of independent points that all pairs count for, bare and clothed, because neighbours on a surface err together."""
 DEFAULT_CONFIG = ScanFitConfig()
 
 
@@ -97,11 +102,11 @@ def fit_scan(
         raise ArgumentError("height", f"{height}: expected metres, 0.5 to 2.6")
     surface = body_surface(without_expression(body), SCAN_LANDMARKS)
     known = known * np.asarray(surface.landmarks.known)
-    whole = scan_problem(surface, surface.landmarks.joint_names, config.shapes)
-    effective = config.effective[int(clothed)]
-    outside = config.cloth if clothed else config.skin
-    tolerances = Tolerances(*(jnp.float32(x) for x in (config.skin, outside, 1.0)))
-    given = lambda align: _given(align, points, known, height, config)
+    whole = scan_problem(surface, surface.landmarks.joint_names, SHAPES)
+    effective = EFFECTIVE[int(clothed)]
+    outside = CLOTH if clothed else SKIN
+    tolerances = Tolerances(*(jnp.float32(x) for x in (SKIN, outside, 1.0)))
+    given = lambda align: _given(align, points, known, height)
     if known.any():
         resting = BodyPose(jnp.asarray(whole.prior.mean), jnp.zeros(3))
         betas = jnp.zeros(surface.points.directions.shape[-1])
@@ -113,14 +118,14 @@ def fit_scan(
             state, _ = improve(whole, ScanMatches.none(), own, tolerances, state, LANDMARK_STEPS)
         iterations = FINE
     else:
-        start, state = search(scan, whole, tolerances, given, config, effective)
+        start, state = search(scan, whole, tolerances, given, effective)
         iterations = (*CLOSER, *FINE)
     target = Target(scan, start.align, config.points, effective, FINE_NORMAL)
     if clothed:
         iterations = tuple(
             dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations
         )
-    state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations, config.steps)
+    state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
     away, covered = target.distances(whole, state, iterations[-1].gate)
@@ -130,12 +135,12 @@ def fit_scan(
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
 
 
-def _given(align, points, known, height, config):
+def _given(align, points, known, height):
     number = lambda x: jnp.asarray(x, jnp.float32)
     return Given(
         points=number(np.where(known[:, None] > 0, align(points), 0.0)),
         weights=number(known),
-        std=number(config.joint_std),
+        std=number(JOINT_STD),
         height=number(height or 0.0),
         height_weight=number(height is not None),
     )

@@ -22,7 +22,6 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.landmark_fit import cube_rotations
 from humangs_jax.fitting.residuals.keypoints import trunk_weights
-from humangs_jax.fitting.residuals.priors import MIRROR, pose_prior
 from humangs_jax.fitting.residuals.scan import (
     BodySurface,
     Given,
@@ -35,38 +34,29 @@ from humangs_jax.fitting.residuals.scan import (
     scan_problem,
     scan_residuals,
 )
-from humangs_jax.fitting.scan_reading import Scan, directions_around
+from humangs_jax.fitting.scan_files import Scan, directions_around
 from humangs_jax.fitting.similarity import Similarity, align_robustly
 from humangs_jax.fitting.solve import Outcome, half_squares, solve
-from humangs_jax.fitting.state import FitState, scale_of, state_of
+from humangs_jax.fitting.state import MIRROR, FitState, pose_prior, scale_of, state_of
 from humangs_jax.geometry import quaternion
 
 
 @dataclasses.dataclass(frozen=True)
 class ScanFitConfig:
-    """Settings of a fit to a scan; lengths in metres of a person.
-
-    samples: points taken from the scan. points: of them, and of the body's vertices, that look for partners; coarse_points:
-    likewise in the search. effective: number of independent points that all pairs count for, bare and clothed, because neighbours
-    on a surface err together. skin: std of a scan on bare skin, and of a body that pokes out of clothes. cloth: std of clothes
-    outside of the skin. joint_std: of given joints. starts: that are followed. turned: how many of the best are also followed
-    facing the other way. steps: of the solver in a round. shapes: coefficients that are fitted.
-    """
+    """Settings of a fit to a scan."""
 
     samples: int = 30_000
+    """Points taken from the scan."""
     points: int = 2500
-    coarse_points: int = 600
-    effective: tuple[float, float] = (1500.0, 300.0)
-    skin: float = 0.004
-    cloth: float = 0.015
-    joint_std: float = 0.01
-    starts: int = 16
-    turned: int = 2
-    steps: int = 4
-    shapes: int = 32
+    """Of them, and of the body's vertices, that look for partners."""
 
 
-# Rounds --------------------------------------------------------------------------------------------------------------
+COARSE_POINTS = 600
+"""The same in the search."""
+STEPS, SHAPES = 4, 32
+"""Of the solver in a round; coefficients that are fitted."""
+FOLLOWED, TURNED = 16, 2
+"""Starts that are followed; and how many of the best are also followed facing the other way."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,21 +88,25 @@ def run_iterations(
     tolerances: Tolerances,
     state: FitState,
     iterations: tuple[Round, ...],
-    steps: int,
 ) -> tuple[FitState, list[Outcome]]:
     """The body after some iterations, and what the solver did in each."""
     outcomes = []
     for each in iterations:
         matches = target.matches(problem, state, each.gate, each.robust_scale, tolerances)
         own = dataclasses.replace(tolerances, prior=jnp.float32(each.prior))
-        state, outcome = improve(problem, matches, given, own, state, steps)
+        state, outcome = improve(problem, matches, given, own, state)
         outcomes.append(outcome)
     return state, outcomes
 
 
 @functools.partial(jax.jit, static_argnames="steps")
 def improve(
-    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int
+    problem: ScanProblem,
+    matches: ScanMatches,
+    given: Given,
+    tolerances: Tolerances,
+    state: FitState,
+    steps: int = STEPS,
 ) -> tuple[FitState, Outcome]:
     """The body after at most `steps` steps of the solver with these pairs, and what the solver did."""
     return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
@@ -305,20 +299,19 @@ def search(
     whole: ScanProblem,
     tolerances: Tolerances,
     given: Callable[[Similarity], Given],
-    config: ScanFitConfig,
     effective: float,
 ) -> tuple[Start, FitState]:
     """The best start, and the body after its coarse iterations, with all joints of `whole` free.
 
     Arguments: given: what is known, in the frame of an alignment of the scan. effective: see `Target`.
     """
-    trunk = scan_problem(whole.surface, BODY_NAMES, config.shapes)
+    trunk = scan_problem(whole.surface, BODY_NAMES, SHAPES)
     loose = dataclasses.replace(tolerances, inside=jnp.float32(LOOSE), outside=jnp.float32(LOOSE))
 
     def follow(start, state=None):
-        target = Target(scan, start.align, config.coarse_points, effective, COARSE_NORMAL)
+        target = Target(scan, start.align, COARSE_POINTS, effective, COARSE_NORMAL)
         state = start_state(trunk, start.rotations) if state is None else state
-        state, _ = run_iterations(trunk, target, given(start.align), loose, state, COARSE, config.steps)
+        state, _ = run_iterations(trunk, target, given(start.align), loose, state, COARSE)
         return leftover(trunk, target, given(start.align), loose, state), start, state
 
     def turned(start, state):
@@ -326,8 +319,8 @@ def search(
         pelvis = np.asarray(landmarks_and_joints(trunk, betas, pose)[1][0], np.float64)
         return facing_back(whole.surface, start, np.asarray(pose.rotations), pelvis, float(scale_of(state)))
 
-    found = sorted(map(follow, search_starts(whole.surface, scan, config.starts)), key=lambda each: each[0])
-    best = found[: config.turned]
+    found = sorted(map(follow, search_starts(whole.surface, scan, FOLLOWED)), key=lambda each: each[0])
+    best = found[:TURNED]
     found = [follow(start, state) for _, start, state in best]  # as many rounds as those that are turned
     found += [follow(turned(start, state)) for _, start, state in best]
     _, start, state = min(found, key=lambda each: each[0])

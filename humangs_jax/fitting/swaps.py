@@ -15,7 +15,7 @@ A view agrees with a landmark by how near its keypoint is to the best of the poi
 
 import dataclasses
 import itertools
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +23,12 @@ import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KeypointSet
 from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations
+from humangs_jax.fitting.state import camera_numbers
 from humangs_jax.fitting.triangulation import MARGIN, reprojection_errors, triangulate_robustly
 
 LEAST_GAIN, CHANCE = 0.1, 0.8
@@ -81,12 +82,11 @@ def find_swaps(
 
     Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none, see `group_by_frame`.
     """
-    rig = _Rig(observations, np.asarray(kind.mirror), views, _camera_numbers(observations, views))
-    order, exchanges, shares = Order.given(*views.shape), [], np.zeros(views.shape)
+    mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
+    order, exchanges, shares = given(*views.shape), [], np.zeros(views.shape)
     while True:
-        state = _State.of(rig, order)
-        flips = _clear_flips(rig, state)
-        tried = _clear_exchanges(rig, state)
+        search = _Search(observations, mirror, cameras, order)
+        flips, tried = search.flips(), search.exchanges()
         best = max(tried, key=lambda each: each.gain, default=None)
         if best is not None and best.gain >= sum(flips[m].gain for m in best.frames if m in flips):
             exchanges.append(_cameras(best, tried, views, names))
@@ -94,9 +94,10 @@ def find_swaps(
         elif flips:
             frames, slots = (np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a"))
             shares[frames, order.source[frames, slots]] = [flip.share for flip in flips.values()]
-            order = order.sides_exchanged(frames, slots)
+            order = order.exchanged(frames, slots, None)
         else:
-            return tuple(sorted([*exchanges, *_sides(rig, state, shares, names)], key=lambda swap: -swap.gain))
+            sides = _sides(observations, views, order, shares, names)
+            return tuple(sorted([*exchanges, *sides], key=lambda swap: -swap.gain))
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
@@ -120,8 +121,7 @@ def find_mirrored(
 
     Arguments: fit: of these observations with this configuration (nothing is compiled again).
     """
-    given = Order.given(observations.points.shape[0], observations.points.shape[1])
-    everywhere = dataclasses.replace(given, mirrored=~given.mirrored)
+    everywhere = given(*observations.points.shape[:2], mirrored=True)
     mirrored = arranged(observations, np.asarray(kind.mirror), everywhere)
     config = dataclasses.replace(config, smoothness=0.0)  # that stage comes later
     # the last stage in units of the expected noise: stage "person" has the noise that each fit found for itself
@@ -133,8 +133,7 @@ def find_mirrored(
 # How well views agree --------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Order:
+class Order(NamedTuple):
     """Which keypoints the c cameras of m frames get.
 
     source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right are exchanged.
@@ -143,22 +142,21 @@ class Order:
     source: Int[np.ndarray, "m c"]
     mirrored: Bool[np.ndarray, "m c"]
 
-    @classmethod
-    def given(cls, frames: int, views: int) -> "Order":
-        """Every camera has its own keypoints."""
-        return cls(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
+    def exchanged(
+        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None
+    ) -> "Order":
+        """The order with the keypoints of cameras a and b exchanged in some frames, or without b left and right of camera a's."""
+        source, mirrored = self.source.copy(), self.mirrored.copy()
+        if b is None:
+            mirrored[frames, source[frames, a]] ^= True
+        else:
+            source[frames, a], source[frames, b] = self.source[frames, b], self.source[frames, a]
+        return Order(source, mirrored)
 
-    def exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"]) -> "Order":
-        """The order with the keypoints of cameras a and b exchanged in some frames."""
-        source = self.source.copy()
-        source[frames, a], source[frames, b] = self.source[frames, b], self.source[frames, a]
-        return dataclasses.replace(self, source=source)
 
-    def sides_exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"]) -> "Order":
-        """The order with left and right of camera a's keypoints exchanged in some frames."""
-        mirrored = self.mirrored.copy()
-        mirrored[frames, self.source[frames, a]] ^= True
-        return dataclasses.replace(self, mirrored=mirrored)
+def given(frames: int, views: int, mirrored: bool = False) -> Order:
+    """Every camera has its own keypoints."""
+    return Order(np.tile(np.arange(views), (frames, 1)), np.full((frames, views), mirrored))
 
 
 def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: Order) -> Observations:
@@ -169,8 +167,7 @@ def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: O
     return replace(observations, points=pick(observations.points), confidences=pick(observations.confidences))
 
 
-@pytree_dataclass
-class Agreement:
+class Agreement(NamedTuple):
     """How well c views agree with the points that they agree on best: confidences summed over keypoints, less for larger errors.
 
     own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's keypoints, and mirrored: (c,)
@@ -193,72 +190,21 @@ def _of_frame(seen, mirror):
 
     def near(keypoints, confidences):
         """Agreement (c,) of all views if each had these keypoints (k, 2)."""
-        given = replace(
-            seen,
-            points=jnp.broadcast_to(keypoints, seen.points.shape),
-            confidences=jnp.broadcast_to(confidences, seen.confidences.shape),
-        )
-        share = 1 - jnp.square(reprojection_errors(given, points) / (MARGIN * seen.noise))
-        return jnp.sum((counts >= 2) * given.confidences * jnp.maximum(share, 0.0), axis=-1)
+        everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
+        points_of, certain = everywhere(keypoints, seen.points), everywhere(confidences, seen.confidences)
+        errors = reprojection_errors(replace(seen, points=points_of, confidences=certain), points)
+        share = jnp.maximum(1 - jnp.square(errors / (MARGIN * seen.noise)), 0.0)
+        return jnp.sum((counts >= 2) * certain * share, axis=-1)
 
     crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
     mirrored = jnp.diagonal(jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror]))
     return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
 
 
-def attainable(
-    confidences: Float[np.ndarray, "m c k"], of: Bool[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, "m c"], Int[np.ndarray, "m c"]]:
-    """Agreement (m, c) if every keypoint in `of` that another view sees agreed, and the number of these keypoints (m, c)."""
-    seen = (confidences > 0) & of
-    shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
-    return (confidences * shared).sum(-1), shared.sum(-1)
-
-
 # Trials --------------------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Rig:
-    """The input. cameras: (m, c) equal numbers for one camera that stands still, -1: no view."""
-
-    observations: Observations
-    mirror: Int[np.ndarray, " k"]
-    views: Int[np.ndarray, "m c"]
-    cameras: Int[np.ndarray, "m c"]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _State:
-    """An order and how well the views agree in it.
-
-    total: (m,). views: (m, c) with keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
-    """
-
-    order: Order
-    confidences: Float[np.ndarray, "m c k"]
-    total: Float[np.ndarray, " m"]
-    views: Bool[np.ndarray, "m c"]
-    sides: Bool[np.ndarray, "m c"]
-    pairs: Bool[np.ndarray, "m c c"]
-
-    @classmethod
-    def of(cls, rig: _Rig, order: Order) -> "_State":
-        seen = arranged(rig.observations, rig.mirror, order)
-        found = jax.tree.map(np.asarray, agreement(seen, rig.mirror))
-        confidences = np.asarray(seen.confidences)
-        views = np.asarray((confidences > 0).any(-1))
-        count = views.sum(-1)[:, None]
-        own = np.diagonal(found.crossed, axis1=1, axis2=2)
-        sides = (count < MANY) | (found.mirrored > own)
-        better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
-        pairs = (count > 2)[..., None] & ((count < MANY)[..., None] | better)
-        sides, pairs = sides & views & (count > 1), pairs & views[:, :, None] & views[:, None]
-        return cls(order, confidences, found.own.sum(-1), views, sides, pairs)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Trial:
+class _Trial(NamedTuple):
     """An exchange in some frames: of cameras a and b, or of the sides of camera a if b is None.
 
     gain: agreement that it adds; share: gain over what `count` keypoints can attain.
@@ -269,58 +215,89 @@ class _Trial:
     count: int
     frames: Int[np.ndarray, " e"]
     a: Int[np.ndarray, " e"]
-    b: Int[np.ndarray, " e"] | None = None
+    b: Int[np.ndarray, " e"] | None
 
     @property
     def clear(self) -> bool:
         return self.share > LEAST_GAIN + CHANCE / max(self.count, 1) ** 0.5
 
 
-def _gains(rig, state, order):
-    """(m,) agreement that another order adds."""
-    return np.asarray(agreement(arranged(rig.observations, rig.mirror, order), rig.mirror).own).sum(-1) - state.total
+class _Search:
+    """Keypoints in an order, how well the views agree, and what exchanges would add.
 
+    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,) agreement. views: (m, c) with
+    keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
+    """
 
-def _trial(gains, most, count, frames, a, b=None):
-    """A trial from gains (e,) in e frames, attainable agreement most (m, c) and numbers of keypoints count (m, c)."""
-    total = lambda values: values[frames, a].sum() + (0 if b is None else values[frames, b].sum())
-    gain = float(gains.sum())
-    return _Trial(gain, gain / max(float(total(most)), 1e-6), int(total(count)), frames, a, b)
+    def __init__(
+        self, observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
+    ) -> None:
+        self.observations, self.mirror, self.cameras, self.order = observations, mirror, cameras, order
+        seen = arranged(observations, mirror, order)
+        found = jax.tree.map(np.asarray, agreement(seen, mirror))
+        self.confidences = np.asarray(seen.confidences)
+        self.total, self.views = found.own.sum(-1), np.asarray((self.confidences > 0).any(-1))
+        count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
+        sides = (count < MANY) | (found.mirrored > own)
+        better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
+        pairs = (count > 2)[..., None] & ((count < MANY)[..., None] | better)
+        self.sides = sides & self.views & (count > 1)
+        self.pairs = pairs & self.views[:, :, None] & self.views[:, None]
 
+    def gains(
+        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None = None
+    ) -> Float[np.ndarray, " e"]:
+        """(e,) agreement that an exchange adds in each of its frames."""
+        order = self.order.exchanged(frames, a, b)
+        own = agreement(arranged(self.observations, self.mirror, order), self.mirror).own
+        return (np.asarray(own).sum(-1) - self.total)[frames]
 
-def _clear_flips(rig, state):
-    """The view of each frame whose sides are exchanged most clearly, by frame."""
-    most, count = attainable(state.confidences, rig.mirror != np.arange(len(rig.mirror)))
-    found: dict[int, _Trial] = {}
-    for slot in np.flatnonzero(state.sides.any(0)):
-        frames = np.flatnonzero(state.sides[:, slot])
-        gains = _gains(rig, state, state.order.sides_exchanged(frames, np.full(len(frames), slot)))
-        for frame in frames:
-            trial = _trial(gains[[frame]], most, count, np.asarray([frame]), np.asarray([slot]))
-            if trial.clear and (frame not in found or trial.gain > found[frame].gain):
-                found[frame] = trial
-    return found
+    def trial(
+        self,
+        gains: Float[np.ndarray, " e"],
+        of: Bool[np.ndarray, " k"],
+        frames: Int[np.ndarray, " e"],
+        a: Int[np.ndarray, " e"],
+        b: Int[np.ndarray, " e"] | None = None,
+    ) -> _Trial:
+        """An exchange with these gains, of the keypoints `of`: attainable is that all agree that another view sees."""
+        seen = (self.confidences > 0) & of
+        shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
+        total = lambda values: sum(values[frames, slots].sum() for slots in (a, b) if slots is not None)
+        most, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
+        gain = float(gains.sum())
+        return _Trial(gain, gain / max(float(most), 1e-6), int(count), frames, a, b)
 
+    def flips(self) -> dict[int, _Trial]:
+        """The view of each frame whose sides are exchanged most clearly, by frame."""
+        found: dict[int, _Trial] = {}
+        for slot in np.flatnonzero(self.sides.any(0)):
+            frames = np.flatnonzero(self.sides[:, slot])
+            gains = self.gains(frames, np.full(len(frames), slot))
+            for i, frame in enumerate(frames):
+                sided = self.mirror != np.arange(len(self.mirror))
+                trial = self.trial(gains[[i]], sided, frames[[i]], np.asarray([slot]))
+                if trial.clear and (frame not in found or trial.gain > found[frame].gain):
+                    found[frame] = trial
+        return found
 
-def _clear_exchanges(rig, state):
-    """Exchanges of two cameras in all of their frames together, and in each alone."""
-    most, count = attainable(state.confidences, np.ones(len(rig.mirror), bool))
-    several = state.views & (state.views.sum(-1, keepdims=True) > 2)
-    cameras = lambda frame, a, b: tuple(sorted(rig.cameras[frame, [a, b]].tolist()))
-    suspected = {cameras(*at) for at in np.argwhere(state.pairs)}
-    tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
-    for a, b in itertools.combinations(range(most.shape[1]), 2):
-        frames = np.flatnonzero(several[:, a] & several[:, b])
-        frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
-        if len(frames):
-            of = [np.full(len(frames), slot) for slot in (a, b)]
-            gains = _gains(rig, state, state.order.exchanged(frames, *of))
-            for frame in frames:
-                tried.setdefault(cameras(frame, a, b), []).append((gains[frame], frame, a, b))
-    alone = [[each] for of in tried.values() if len(of) > 1 for each in of]
-    columns = [map(np.asarray, zip(*group, strict=True)) for group in (*tried.values(), *alone)]
-    trials = [_trial(gains, most, count, *where) for gains, *where in columns]
-    return [trial for trial in trials if trial.clear]
+    def exchanges(self) -> list[_Trial]:
+        """Exchanges of two cameras in all of their frames together, and in each alone."""
+        several = self.views & (self.views.sum(-1, keepdims=True) > 2)
+        cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
+        suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
+        tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
+        for a, b in itertools.combinations(range(self.views.shape[1]), 2):
+            frames = np.flatnonzero(several[:, a] & several[:, b])
+            frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
+            if len(frames):
+                gains = self.gains(frames, *(np.full(len(frames), slot) for slot in (a, b)))
+                for frame, gain in zip(frames, gains, strict=True):
+                    tried.setdefault(cameras(frame, a, b), []).append((gain, frame, a, b))
+        alone = [[each] for of in tried.values() if len(of) > 1 for each in of]
+        every = np.ones(len(self.mirror), bool)
+        columns = [map(np.asarray, zip(*group, strict=True)) for group in (*tried.values(), *alone)]
+        return [trial for gains, *where in columns if (trial := self.trial(gains, every, *where)).clear]
 
 
 def _cameras(best, tried, views, names):
@@ -331,29 +308,22 @@ def _cameras(best, tried, views, names):
     return Swap("cameras", name(best), best.share, tuple(others), len(best.frames))
 
 
-def _sides(rig, state, shares, names):
+def _sides(observations, views, order, shares, names):
     """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
     found = []
-    seen = np.any(np.asarray(rig.observations.confidences) > 0, axis=-1)
-    for views, mirrored, exists, gains in zip(rig.views, state.order.mirrored, seen, shares, strict=True):
-        others = views[exists & ~mirrored]
+    seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
+    for own, mirrored, exists, gains in zip(views, order.mirrored, seen, shares, strict=True):
+        others = own[exists & ~mirrored]
         instead = tuple(names[v] for v in others) if len(others) == mirrored.sum() else ()
-        found += [
-            Swap("sides", (names[v],), gain, instead)
-            for v, gain in zip(views[mirrored], gains[mirrored].tolist(), strict=True)
-        ]
+        pairs = zip(own[mirrored], gains[mirrored].tolist(), strict=True)
+        found += [Swap("sides", (names[v],), gain, instead) for v, gain in pairs]
     return found
 
 
 def _camera_numbers(observations, views):
     """(m, c) equal for views of one camera that stands still; -1 where there is no view."""
-    focal = np.asarray(observations.K)[..., :1, 0]
-    flat = lambda matrices: np.asarray(matrices).reshape(*views.shape, -1)
-    cameras = np.concatenate([np.log(focal), flat(observations.K) / focal, flat(observations.cam_from_world)], axis=-1)
-    numbers, known = np.full(views.shape, -1), np.empty((0, cameras.shape[-1]))
-    for frame, slot in np.argwhere(views >= 0):
-        same = np.flatnonzero(np.abs(known - cameras[frame, slot]).max(axis=-1) < SAME_CAMERA)
-        numbers[frame, slot] = same[0] if len(same) else len(known)
-        if not len(same):
-            known = np.concatenate([known, cameras[frame, slot][None]])
+    there = np.nonzero(views >= 0)
+    matrices = (np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world))
+    numbers = np.full(views.shape, -1)
+    numbers[there] = camera_numbers(*matrices, SAME_CAMERA)
     return numbers

@@ -12,7 +12,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.residuals.priors import pose_prior
+from humangs_jax.fitting.state import pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 SIZE, NOISE = 256, 1.0

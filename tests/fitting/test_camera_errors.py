@@ -11,8 +11,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.camera_errors import find_camera_errors, mended
-from humangs_jax.fitting.examination import examine
-from humangs_jax.fitting.fit_capture import fit_photos
+from humangs_jax.fitting.fit_capture import examine, fit_photos
 from humangs_jax.geometry import quaternion, transform
 from tests.fitting.seen_people import person
 

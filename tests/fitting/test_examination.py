@@ -9,8 +9,8 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.examination import examine, examine_record
 from humangs_jax.fitting.files import FitRecord
+from humangs_jax.fitting.fit_capture import examine, examine_record
 from humangs_jax.fitting.report import (
     NAMED,
     ROWS,

@@ -8,7 +8,7 @@ from humangs_jax.apps import check as module
 from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet, plot_over_time
 from humangs_jax.avatar.sheets import GAP
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.examination import examine
+from humangs_jax.fitting.fit_capture import examine
 from humangs_jax.fitting.report import FitReport, ViewReport
 from humangs_jax.io.images import read_image
 

@@ -8,9 +8,9 @@ from fit_people import POSES, model_of, observe
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting import landmark_fit
+from humangs_jax.fitting.fit_capture import fit_uncertainty
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks
-from humangs_jax.fitting.residuals.priors import pose_prior, violations
-from humangs_jax.fitting.uncertainty import fit_uncertainty
+from humangs_jax.fitting.state import pose_prior, violations
 
 CONFIG = FitConfig()
 NAMES = list(POSES)
@@ -112,7 +112,7 @@ def test_nothing_seen_at_all_is_finite(noisy):
 
 def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
     joints, _, seen, fit = noisy
-    found = fit_uncertainty(model_of(), seen, fit, CONFIG)
+    found = fit_uncertainty(model_of(), seen, fit)
     errors = np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1)
     ratio = np.sqrt((errors**2).mean() / (found.joint_std**2).mean())
     assert 0.3 < ratio < 1.5  # landmarks of hips and shoulders are trusted less than these true ones deserve
@@ -136,7 +136,7 @@ def still():
 @pytest.mark.slow
 def test_what_one_view_does_not_determine_is_told(still):
     joints, seen, fit = still
-    found = fit_uncertainty(model_of(), seen, fit, CONFIG)
+    found = fit_uncertainty(model_of(), seen, fit)
     camera = np.asarray(seen.cam_from_world[0, 0])
     away = joints + camera[:3, :3].T @ camera[:3, 3]
     depth = away / np.linalg.norm(away, axis=-1, keepdims=True)

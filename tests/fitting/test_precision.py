@@ -15,9 +15,9 @@ from humangs_jax.avatar.export.gaussians import turned
 from humangs_jax.body import skinning
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
-from humangs_jax.fitting import landmark_fit, uncertainty
+from humangs_jax.fitting import fit_capture, landmark_fit
 from humangs_jax.fitting.landmark_fit import FitConfig, keypoint_problem
-from humangs_jax.fitting.residuals import boundaries, scan
+from humangs_jax.fitting.residuals import scan, silhouettes
 from humangs_jax.fitting.residuals.keypoints import Observations, frame_residuals
 from humangs_jax.fitting.solve import solve
 from humangs_jax.fitting.state import Origin, camera_origin, cameras_of, clothing_thickness, segments, zero_state
@@ -154,7 +154,7 @@ PROGRAMS = {
     "refinement": lambda: precisions(clothed, zero_state(MOVED)),
     "Levenberg and Marquardt": lambda: precisions(lambda x: solve(jnp.sin, x, 3, method="lm"), jnp.ones(4)),
     "L-BFGS": lambda: precisions(lambda x: solve(lambda y: jnp.sin(y @ y), x, 3, method="lbfgs"), jnp.ones(4)),
-    "boundaries": lambda: precisions(lambda v: boundaries._look(v, FACES, CAMERA), jnp.ones((4, 3))),
+    "boundaries": lambda: precisions(lambda v: silhouettes._look(v, FACES, CAMERA), jnp.ones((4, 3))),
     "decoder": lambda: precisions(decoded, jnp.ones((5, 1, 10)), jnp.ones((5, 1, 2))),
     "pixels of vertices": lambda: precisions(project_vertices, CAMERA, jnp.ones((4, 3))),
     "exports": lambda: precisions(lambda g: turned(g, "z"), GAUSSIANS),
@@ -163,7 +163,7 @@ PROGRAMS = {
 WHOLE = {
     "fit": lambda: precisions(lambda seen: landmark_fit._fit_frames(MODEL, seen, FitConfig()), SEEN),
     "motion": lambda: precisions(lambda s, f: landmark_fit.smooth_motion(MODEL, s, f, CONFIG), SEEN, fitted()),
-    "uncertainty": lambda: precisions(lambda s, f: uncertainty._derivatives(MODEL, s, f, CONFIG), SEEN, fitted()),
+    "uncertainty": lambda: precisions(lambda s, f: fit_capture._derivatives(MODEL, s, f), SEEN, fitted()),
 }
 
 

@@ -16,8 +16,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting import refine as module
-from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene, Score, start_state, usual_config
+from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, Score, refine_capture, start_state, usual_config
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh

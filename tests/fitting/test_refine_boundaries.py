@@ -5,8 +5,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from humangs_jax.fitting.residuals.boundaries import BodyView, body_boundary, mask_boundary, mesh_edges, view_body
-from humangs_jax.fitting.residuals.silhouettes import MaskView, distances, match, silhouette_residuals
+from humangs_jax.fitting.residuals.silhouettes import (
+    BodyView,
+    MaskView,
+    body_boundary,
+    distances,
+    mask_boundary,
+    match,
+    mesh_edges,
+    silhouette_residuals,
+    view_body,
+)
 from humangs_jax.geometry.camera import Camera
 
 SIZE, FOCAL, DISTANCE, RADIUS = 128, 160.0, 3.0, 0.8

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.fitting.files import save_scan_fit
-from humangs_jax.fitting.residuals.priors import pose_prior
 from humangs_jax.fitting.residuals.scan import body_surface
+from humangs_jax.fitting.scan_files import checked_joints, read_joints, sample_scan
 from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
-from humangs_jax.fitting.scan_reading import checked_joints, read_joints, sample_scan
 from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts
 from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.state import pose_prior
 from humangs_jax.io.npz import read_npz
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 

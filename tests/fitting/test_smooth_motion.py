@@ -38,7 +38,7 @@ def landmarks_of(rotations, translations):
 
 @jax.jit
 def states_of(rotations, translations):
-    origin = keypoint_problem(MODEL, CONFIG).origin
+    origin = keypoint_problem(MODEL).origin
     states = jax.vmap(lambda r, t: state_of(origin, jnp.zeros(1), BodyPose(r, t)))(rotations, translations)
     return replace(states, betas=states.betas[0])
 
@@ -73,7 +73,7 @@ def smoothed(seen, start, spoilt=(), config=CONFIG):
     nothing = jnp.zeros((FRAMES, 1, 3))
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations))
     state = states_of(rotations, translations)
-    fit = LandmarkFit(state.betas, poses, nothing, nothing, seen.noise, state, {}, jnp.zeros(()))
+    fit = LandmarkFit(state.betas, poses, nothing, nothing, seen.noise, state, {}, jnp.zeros(()), jnp.ones(8))
     return smooth_motion(MODEL, seen, fit, config)
 
 
@@ -146,7 +146,7 @@ def test_nothing_seen_at_all_is_finite(walk):
 
 @jax.jit
 def bridged(seen, state):
-    problem = keypoint_problem(MODEL, CONFIG)
+    problem = keypoint_problem(MODEL)
     return landmark_fit._poses(problem, landmark_fit._bridged(problem, seen, state))
 
 

@@ -19,6 +19,7 @@ def toy_model():
         joint_directions=jnp.asarray(0.1 * JOINTS[..., None]),
         points=points,
         regressor=jnp.eye(8),
+        certainty=jnp.ones(8),
         names=(*names, *(f"point{i}" for i in range(4))),
         known=(True,) * 8,
         parents=(-1, 0, 1, 2),

@@ -39,8 +39,7 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import read_fit_record
-from humangs_jax.fitting.scan_reading import read_joints, read_mesh
-from humangs_jax.fitting.scan_views import read_placement
+from humangs_jax.fitting.scan_files import read_joints, read_mesh, read_placement
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
 from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import read_json, reading

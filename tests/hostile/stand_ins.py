@@ -52,7 +52,7 @@ from humangs_jax.training.validation import METRICS
 HEAVY = (
     *("apps.check", "apps.demo", "apps.settings", "avatar.frames", "avatar.layers", "avatar.video"),
     *("data.calibration.importing", "people.writer", "refinement.refine", "training.diagnose", "viewer.page"),
-    *("fitting.examination", "fitting.fit_capture", "fitting.refine", "fitting.scan_views", "network.conversion"),
+    *("fitting.fit_capture", "fitting.refine", "fitting.scan_files", "network.conversion"),
 )
 LATE = ("orbax.checkpoint", "tensorboardX", "OpenEXR", "safetensors.numpy", "plyfile", "imageio_ffmpeg", "tqdm")
 for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
@@ -232,7 +232,7 @@ def stand_ins(variant):
         "fitting.fit_capture.fit_photos": fitted,
         "fitting.refine.refine_capture": refined,
         "fitting.scan_fit.fit_scan": in_scan,
-        "fitting.scan_views._draw": mesh_views,
+        "fitting.scan_files._draw": mesh_views,
         "network.conversion.load_checkpoint": converted,
         "network.conversion.describe": lambda _: "a network",
         "losses.loss_networks.collect_loss_networks": lambda _: ({"x": np.ones(999)}, ["VGG-19"]),

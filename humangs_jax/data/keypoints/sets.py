@@ -16,7 +16,10 @@ Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data form
 
 import dataclasses
 
-from humangs_jax.body.landmarks import Place, both_sides, place
+import numpy as np
+
+from humangs_jax.body.landmarks import Place, both_sides, place, plain_places
+from humangs_jax.core.array_types import Float
 
 SIDES = ("left", "right")
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -45,14 +48,28 @@ _FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
 class KeypointSet:
     """The points of a detector: their names in its order, and for each the index of its mirror image.
 
-    A point in the middle of the body is its own mirror image. places: on the body, of the points that the detector sees elsewhere
-    than `body.landmarks` has them.
+    A point in the middle of the body is its own mirror image. places: on the body, of points that may lie elsewhere than
+    `body.landmarks` has them: where the detector is known to see them, or a fit has found that it does. certainty: (k,) of the
+    points, the reciprocal of their noise over that of all, if a fit has found it; none: as usual.
     """
 
     name: str
     names: tuple[str, ...]
     mirror: tuple[int, ...]
     places: tuple[Place, ...] = ()
+    certainty: tuple[float, ...] = ()
+
+    @property
+    def offsets(self) -> Float[np.ndarray, "k 3"]:
+        """Of the places of the points, metres; 0 for points without."""
+        known = {place.name: place.offset for place in self.places}
+        return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
+
+    def adapted(self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]) -> "KeypointSet":
+        """The set as a detector is found to use it: with these offsets of the places, metres, and this certainty."""
+        own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
+        places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
+        return dataclasses.replace(self, places=places, certainty=tuple(np.asarray(certainty, float).tolist()))
 
 
 def hand_names(side: str) -> tuple[str, ...]:
@@ -77,7 +94,9 @@ def _mirrored_face(i: int) -> int:
 
 
 def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
-    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names), places)
+    return KeypointSet(
+        name, names, tuple(names.index(mirrored_name(each)) for each in names), places or plain_places(names)
+    )
 
 
 COCO_17 = _keypoint_set("coco17", _COCO)

@@ -6,27 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
+from humangs_jax.body.landmarks import LandmarkModel, kind_of, pose_landmarks
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
-from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals
 from humangs_jax.fitting.solve import robust
-from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of
+from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of
 from humangs_jax.geometry.transform import EXACT
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
-LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
-"""Multiples of the noise for landmarks on whose position annotators disagree."""
 NOISE, LEAST_NOISE = 0.005, 0.3
 """Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a lower bound, pixels."""
 OUTER = (0.03, 0.97)
 """Quantiles of the coordinates between which a person's size is measured, so that outliers do not count."""
 NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
+PLACE_STD = 0.02
+"""Metres: how far from where they are thought to be detectors see landmarks."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a vector whose two components have a std of 1."""
 
@@ -81,8 +80,9 @@ def expected_noise(
     return np.asarray([of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32)
 
 
-def found_noise(median: Array, expected: Array) -> Array:
-    """Pixels, from the median error, which outliers hardly change; the expected noise where that is NaN."""
+def found_noise(lengths: Array, expected: Array) -> Array:
+    """Pixels, from the median of errors, which outliers hardly change; NaN is none, and without any it is as expected."""
+    median = jnp.nanmedian(lengths)
     found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
     return jnp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
 
@@ -105,11 +105,6 @@ def keypoint_errors(observations: Observations, landmarks: Float[Array, "k 3"]) 
     return pixels + observations.K[:, None, :2, 2] - observations.points
 
 
-def landmark_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """(k,) the weight of a landmark's error in (0, 1], see `LESS_CERTAIN`."""
-    return np.asarray([1 / LESS_CERTAIN.get(_kind(name), 1.0) for name in names], np.float32)
-
-
 TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
 """Landmarks that hardly depend on the pose."""
 LIMBS = 0.02
@@ -118,19 +113,14 @@ LIMBS = 0.02
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
     """(k,) 1 for landmarks of the trunk, `LIMBS` for others."""
-    return np.asarray([1.0 if _kind(name) in TRUNK else LIMBS for name in names], np.float32)
-
-
-def _kind(name):
-    return name.split("_", 1)[1] if name.startswith(("left_", "right_")) else name
+    return np.asarray([1.0 if kind_of(name) in TRUNK else LIMBS for name in names], np.float32)
 
 
 def keypoint_residuals(
     model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
 ) -> Float[Array, "c k 2"]:
     """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
-    certainty = landmark_certainty(model.names)[:, None]
-    errors = keypoint_errors(observations, landmarks) / observations.noise * certainty
+    errors = keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
     weights = observations.confidences * np.asarray(model.known, np.float32)
     return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)[..., None] * robust(
         errors, scale
@@ -148,22 +138,24 @@ class Targets:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KeypointProblem:
-    """What stays the same in a fit to keypoints: landmarks, prior, origin, weights of the priors of pose and shape."""
+    """What stays the same in a fit to keypoints."""
 
     model: LandmarkModel
     prior: PosePrior
     origin: Origin
-    pose_weight: float = 1.0
-    shape_weight: float = 1.0
 
     @property
     def known(self) -> Float[np.ndarray, " k"]:
         """(k,) 1 for landmarks that the body has."""
         return np.asarray(self.model.known, np.float32)
 
+    def model_of(self, state: FitState) -> LandmarkModel:
+        """The landmarks, where the state has their places."""
+        return self.model if state.places is None else self.model.moved(PLACE_STD * state.places)
+
     def landmarks_and_joints(self, state: FitState) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
         """Landmarks and joints of a state, metres."""
-        return pose_landmarks(self.model, betas_of(self.origin, state), pose_of(self.origin, state))
+        return pose_landmarks(self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state))
 
 
 def frame_residuals(
@@ -175,12 +167,12 @@ def frame_residuals(
 ) -> dict[str, Float[Array, "..."]]:
     """All residuals of one frame, by kind; half their square sum is the negative log posterior."""
     betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
-    landmarks, _ = pose_landmarks(problem.model, betas, pose)
+    landmarks, _ = pose_landmarks(problem.model_of(state), betas, pose)
     found = {
         "keypoints": keypoint_residuals(problem.model, observations, landmarks, scale),
-        "pose": problem.pose_weight * state.body_pose,
+        "pose": state.body_pose,
         "limits": limit_residuals(problem.prior, problem.origin.joints, pose.rotations),
-        "shape": problem.shape_weight * state.betas,
+        "shape": state.betas,
     }
     if targets is not None:
         known = (targets.known * problem.known)[:, None]

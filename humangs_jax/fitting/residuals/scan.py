@@ -20,11 +20,20 @@ from humangs_jax.body.resolution import decimate
 from humangs_jax.body.skinning import SurfacePoints, pose_points
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals, pose_prior
-from humangs_jax.fitting.scan_reading import Scan
+from humangs_jax.fitting.scan_files import Scan
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.solve import robust
-from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of, scale_of, usual_origin
+from humangs_jax.fitting.state import (
+    FitState,
+    Origin,
+    PosePrior,
+    betas_of,
+    limit_residuals,
+    pose_of,
+    pose_prior,
+    scale_of,
+    usual_origin,
+)
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
