@@ -274,7 +274,7 @@ class _Search:
         for slot in np.flatnonzero(self.sides.any(0)):
             frames = np.flatnonzero(self.sides[:, slot])
             gains = self.gains(frames, np.full(len(frames), slot))
-            for i, frame in enumerate(frames):
+            for i, frame in enumerate(frames.tolist()):
                 sided = self.mirror != np.arange(len(self.mirror))
                 trial = self.trial(gains[[i]], sided, frames[[i]], np.asarray([slot]))
                 if trial.clear and (frame not in found or trial.gain > found[frame].gain):
