@@ -60,7 +60,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 
 @jax.jit
-def _animate(avatar, pose):
+def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return factored(skin(avatar, pose))
 
 

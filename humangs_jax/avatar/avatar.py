@@ -2,7 +2,8 @@
 
 import json
 import os
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +125,7 @@ class Avatar(Batchable):
             return _load(cls, path)
 
 
-def _load(cls, path):
+def _load(cls: type[Avatar], path: Any) -> Avatar:
     try:
         arrays, _ = read_npz(path)
         header = parse_json(str(arrays["header"]))
@@ -159,7 +160,7 @@ def _load(cls, path):
     )
 
 
-def _check_arrays(arrays, j):
+def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
     """Of an avatar of j joints, as its file holds them. Raises: Refused."""
     g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
     if not g or not n:

@@ -13,7 +13,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
@@ -178,7 +178,7 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
     return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in longer.T], axis=-1)
 
 
-def _fitting_distance(shot, points, targets, axes) -> float:
+def _fitting_distance(shot: Shot, points: np.ndarray, targets: np.ndarray, axes: np.ndarray) -> float:
     """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z behind the target."""
     needed = 0.0
     for i, target in enumerate(targets):
@@ -189,7 +189,7 @@ def _fitting_distance(shot, points, targets, axes) -> float:
 
 
 @functools.partial(jax.jit, static_argnames="parents")
-def _paths(means, weights, rest_joints, parents, poses):
+def _paths(means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose) -> Array:
     """(m, p, 3) places of Gaussians in each pose, one pose at a time."""
 
     def one(pose):

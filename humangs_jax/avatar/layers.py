@@ -146,7 +146,7 @@ def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: I
     write_exr(Path(path), [_plain_view(f"view_{i:03d}", camera, rendering) for i, (camera, rendering) in each])
 
 
-def _plain_view(name, camera, rendering) -> ExrView:
+def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
     alpha = np.asarray(rendering.alpha)
     return ExrView(
         rgba=np.concatenate([np.asarray(rendering.rgb), alpha[..., None]], axis=-1),
@@ -189,6 +189,6 @@ def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
 
 
 @jax.jit
-def _posed_normals(normals, avatar, pose):
+def _posed_normals(normals: Float[Array, "g 3"], avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
     transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     return turned_normals(normals, blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3])

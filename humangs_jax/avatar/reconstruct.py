@@ -113,7 +113,7 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
     return body, views, config
 
 
-def _stacked(config, captures):
+def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, SubjectViews, HumanGSConfig, list[bool]]:
     """Body, views, configuration; and whether each world has been turned."""
     if not captures:
         raise ValueError("captures: none given")
@@ -187,7 +187,9 @@ def reconstruct_views(
 
 
 @jax.jit
-def _reconstruct(variables, config, body, views):
+def _reconstruct(
+    variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
+) -> tuple[Avatar, Int[Array, ""]]:
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 
 
@@ -273,21 +275,23 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
-def _assemble(variables, config, body, views, inputs):
+def _assemble(
+    variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews, inputs: HumanGSInputs
+) -> tuple[Avatar, Int[Array, ""]]:
     outputs, _ = apply_humangs(variables, inputs, config)
     return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
 
 
-def _prepare_subjects(body, batch, config):
+def _prepare_subjects(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     return jax.lax.map(lambda views: prepare_inputs(body, views, config), batch)
 
 
-def _most_needed(inputs, config):
+def _most_needed(inputs: HumanGSInputs, config: HumanGSConfig) -> Array:
     count = lambda subject: needed_tokens(subject, config)
     return jnp.max(jax.vmap(count)(inputs)) if inputs.images.ndim == 5 else count(inputs)
 
 
-def _check(capture, name):
+def _check(capture: Capture, name: str) -> None:
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
     check_limit("network_views", capture.view_count, f"photos in {name}")
@@ -318,7 +322,7 @@ def _check(capture, name):
     check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
 
 
-def _check_posed(inputs, name):
+def _check_posed(inputs: HumanGSInputs, name: str) -> None:
     """The other arrays of a body are large, and each of them moves vertices."""
     try:
         check_values(f"reconstruct: {name}", {"the posed vertices": (inputs.posed_vertices, FINITE)})
@@ -326,7 +330,7 @@ def _check_posed(inputs, name):
         raise ValueError(f"{error}; are the arrays of its body finite?") from error
 
 
-def _equal(body, other):
+def _equal(body: BodyModel, other: BodyModel) -> bool:
     if jax.tree.structure(body) != jax.tree.structure(other):
         return False
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(body), jax.tree.leaves(other), strict=True))

@@ -134,5 +134,5 @@ def error_legend(width: int, text_height: int, largest: float | int) -> Float[np
     return write_texts(legend, texts, text_height)
 
 
-def _text_height(width):
+def _text_height(width: int) -> int:
     return int(np.clip(width * TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT))

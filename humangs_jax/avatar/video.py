@@ -5,9 +5,10 @@ loop), or a folder of PNG files (may be transparent).
 import contextlib
 import itertools
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def write_images(folder: Path, frames: Iterable[np.ndarray], fps: float, shape: 
         write_png(folder / f"frame_{i:05d}.png", frame)
 
 
-def _checked(path, frames):
+def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for i, frame in enumerate(frames):
         shape = frame.shape if shape is None else shape
@@ -128,7 +129,9 @@ def write_webm(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tupl
     _write_by_ffmpeg(path, frames, fps, shape, quality)
 
 
-def _write_by_ffmpeg(path, frames, fps, shape, quality):
+def _write_by_ffmpeg(
+    path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]
+) -> None:
     """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 
@@ -162,7 +165,7 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
         raise OSError(f"{path}: ffmpeg failed: {problem}")
 
 
-def _indexed(frame, palette, background):
+def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
     """A frame (h, w, 3) in the palette's colors; Pillow looks up colors by their upper 6 bits, which white and 252 share."""
     from PIL import Image
 
@@ -173,7 +176,7 @@ def _indexed(frame, palette, background):
     return image
 
 
-def _commonest(pixels):
+def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
     """The most frequent color (3,) of (h, w, 3) pixels: the background, where it is of one color."""
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
     values, counts = np.unique(packed, return_counts=True)

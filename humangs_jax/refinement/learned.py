@@ -134,11 +134,11 @@ def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Ar
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 
 
-def _mean_forward(values, neighbors):
+def _mean_forward(values: Array, neighbors: Neighbors) -> tuple[Array, Neighbors]:
     return neighbor_mean(values, neighbors), neighbors
 
 
-def _mean_backward(neighbors, cotangent):
+def _mean_backward(neighbors: Neighbors, cotangent: Array) -> tuple[Array, None]:
     shared = cotangent * jnp.max(neighbors.share, axis=1, keepdims=True)
     present = neighbors.share > 0
     return jnp.sum(shared[neighbors.index] * present[..., None], axis=1), None
@@ -217,7 +217,7 @@ class Refiner(nn.Module):
         return nn.Dense(self.width, kernel_init=nn.initializers.zeros, name="cluster_out")(around)
 
 
-def _relative_errors(values, signals):
+def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
     """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colors before the sigmoid."""
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))

@@ -27,6 +27,7 @@ batch is one call with more tiles, not a loop of masked loops.
 
 import functools
 import math
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -34,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, expand
@@ -44,6 +45,7 @@ FEATURES = slice(6, 10)
 FEATURE_COUNT = 4
 """Red, green, blue and z. A constant: XLA unrolls them."""
 SPLAT_WIDTH = 10
+Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
 EXACT = lax.Precision.HIGHEST
 """GPUs and TPUs would otherwise round the factors of a product to 10 or 8 bits."""
 
@@ -70,14 +72,14 @@ def composite(
     return _composite_fwd(splats, lists, grid, config)[0]
 
 
-def _composite_fwd(splats, lists, grid, config):
+def _composite_fwd(splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig) -> tuple[PyTree, PyTree]:
     features, transmittance, lengths, peaks = _scheduled(
         forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
     )
     return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
 
 
-def _composite_bwd(grid, config, saved, cotangents):
+def _composite_bwd(grid: TileGrid, config: SplatConfig, saved: PyTree, cotangents: PyTree) -> tuple[Array, None]:
     splats, lists, features, transmittance, lengths = saved
     g, g_transmittance, _ = cotangents
     total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
@@ -89,11 +91,11 @@ def _composite_bwd(grid, config, saved, cotangents):
 composite.defvjp(_composite_fwd, _composite_bwd)
 
 
-def _scheduled(on_cpu, elsewhere, grid, config, *arrays):
+def _scheduled(on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array) -> PyTree:
     return lax.platform_dependent(*arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config))
 
 
-def _splat_gradients(splats, sums):
+def _splat_gradients(splats: Float[Array, "g 10"], sums: Float[Array, "g 10"]) -> Float[Array, "g 10"]:
     """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w g."""
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T
@@ -107,7 +109,7 @@ def _splat_gradients(splats, sums):
 # What both schedules share -------------------------------------------------------------------------------------------
 
 
-def joined_over_batch(function):
+def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """Under `vmap`, a function of (splats, items, starts, more per tile...) is called once, with the tiles of all images.
 
     Its outputs must be arrays per tile or per splat; those of the images then follow one another.
@@ -212,7 +214,7 @@ last stored link on; storing T after every splat costs more than that."""
 
 
 @functools.lru_cache
-def forward_by_blocks(grid: TileGrid, config: SplatConfig):
+def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
     """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), used parts of the lists (t,), peaks (g,).
 
     peaks: largest w of each splat; 0 unless `config.visibility`.
@@ -271,7 +273,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig):
 
 
 @functools.lru_cache
-def backward_by_blocks(grid: TileGrid, config: SplatConfig):
+def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
     """(splats, items, starts, lengths, g (t, 4, p), Q (t, p)) -> sums over pixels for each splat, (g, 10).
 
     They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
@@ -323,7 +325,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig):
     return backward
 
 
-def _lists_of(tile, starts, counts):
+def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
 
 
@@ -376,7 +378,7 @@ def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step:
 
 
 @functools.lru_cache
-def forward_by_chunks(grid: TileGrid, config: SplatConfig):
+def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
     """As `forward_by_blocks`."""
     log_stop = _log_stop(config)
 
@@ -412,7 +414,7 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig):
 
 
 @functools.lru_cache
-def backward_by_chunks(grid: TileGrid, config: SplatConfig):
+def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
     """As `backward_by_blocks`."""
     log_stop = _log_stop(config)
 
@@ -454,31 +456,31 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig):
     return backward
 
 
-def _most_chunks(capacity, t):
+def _most_chunks(capacity: int, t: int) -> int:
     """Full chunks, and for each list one that is not."""
     return capacity // CHUNK + min(t, capacity)
 
 
-def _chunks_per_step(grid, dtype, capacity, t):
+def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: int) -> int:
     fitting = STEP_BYTES // (CHUNK * grid.pixels * np.dtype(dtype).itemsize)
     return max(1, min(fitting, STEP_CHUNKS, _most_chunks(capacity, t)))
 
 
-def _log_stop(config):
+def _log_stop(config: SplatConfig) -> float:
     return math.log(config.transmittance_stop) if config.transmittance_stop > 0 else -math.inf
 
 
-def _slice(chunks, i, step):
+def _slice(chunks: Chunks, i: Array | int, step: int) -> Chunks:
     parts = (lax.dynamic_slice_in_dim(v, i * step, step) for v in chunks[:-1])
     return Chunks(*parts, chunks.steps)
 
 
-def _fading(raw, config):
+def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
     alpha = visible_alpha(raw, config)
     return alpha, jnp.maximum(jnp.log1p(-alpha), _LOG_ZERO)
 
 
-def _sums_before(x, tiles, tail):
+def _sums_before(x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: tuple[Array, Array]) -> tuple[Array, Array]:
     """Sums of x (B, k, p) along its lists: of what comes before each chunk (B, p), and from there to each splat."""
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
@@ -490,9 +492,9 @@ def _sums_before(x, tiles, tail):
     return before + jnp.where((tiles == tail_tile)[:, None], tail_sum, 0.0), since
 
 
-def _tail(tiles, before, through):
+def _tail(tiles: Array, before: Array, through: Array) -> tuple[Array, Array]:
     return tiles[-1], before[-1] + through[-1, -1]
 
 
-def _no_tail(t, p, dtype):
+def _no_tail(t: int, p: int, dtype: np.dtype | type) -> tuple[Array, Array]:
     return jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype)

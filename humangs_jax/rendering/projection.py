@@ -21,13 +21,14 @@ values and pass zero gradients. K's skew is taken as 0.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
@@ -40,6 +41,9 @@ from humangs_jax.rendering.splat_config import (
     NEAR,
     SplatConfig,
 )
+
+Planes = list[Array]
+"""Arrays of (g,) numbers."""
 
 
 class ProjectedGaussians(NamedTuple):
@@ -152,7 +156,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
     )
 
 
-def _covariance(m0, m1, eps2d):
+def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:
     """xx, xy, yy and determinant of cov2d from the rows of M."""
     xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
     normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
@@ -160,7 +164,7 @@ def _covariance(m0, m1, eps2d):
     return xx + eps2d, xy, yy + eps2d, determinant
 
 
-def _dimming(m0, m1, determinant, eps2d, low_pass):
+def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, low_pass: Array) -> Array:
     """Factor of the opacity; low_pass in pixels. 1 for footprints whose determinant overflows."""
     finite = determinant < jnp.inf
     m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
@@ -169,13 +173,13 @@ def _dimming(m0, m1, determinant, eps2d, low_pass):
     return jnp.sqrt(jnp.maximum(share, LEAST_DIMMING**2))
 
 
-def _cross(m0, m1, j, i):
+def _cross(m0: Planes, m1: Planes, j: int, i: int) -> Array:
     """Cross product of the columns j and i of M."""
     return m0[j] * m1[i] - m1[j] * m0[i]
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _conic_factor(m0, m1, eps2d):
+def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, Array]:
     """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some finite numbers.
 
     Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11 (g: the cotangents),
@@ -198,12 +202,12 @@ def _conic_factor(m0, m1, eps2d):
     return r00, -r00 * (xy / yy), lax.rsqrt(2 * yy)
 
 
-def _conic_factor_fwd(m0, m1, eps2d):
+def _conic_factor_fwd(m0: Planes, m1: Planes, eps2d: float) -> tuple[PyTree, PyTree]:
     r = _conic_factor(m0, m1, eps2d)
     return r, (m0, m1, r)
 
 
-def _conic_factor_bwd(eps2d, saved, cotangents):
+def _conic_factor_bwd(eps2d: float, saved: PyTree, cotangents: PyTree) -> tuple[Planes, Planes]:
     m0, m1, (r00, r01, r11) = saved
     g00, g01, g11 = cotangents
     k00, k01, k11 = r00 * g00 + r01 * g01, r11 * g01, r11 * g11
@@ -221,7 +225,7 @@ def _conic_factor_bwd(eps2d, saved, cotangents):
 _conic_factor.defvjp(_conic_factor_fwd, _conic_factor_bwd)
 
 
-def _times_factors(rows, gaussians: Gaussians, normalize_quats: bool):
+def _times_factors(rows: Sequence[Planes], gaussians: Gaussians, normalize_quats: bool) -> list[Planes]:
     """Rows @ A R diag(s) for 2 x 3 rows of planes."""
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))
@@ -232,7 +236,7 @@ def _times_factors(rows, gaussians: Gaussians, normalize_quats: bool):
     return [[row[j] * scales[j] for j in range(3)] for row in rows]
 
 
-def _rotation_planes(quats):
+def _rotation_planes(quats: Float[Array, "g 4"]) -> list[Planes]:
     """`quaternion.to_matrix`, entry by entry."""
     w, x, y, z = _planes(quats)
     return [
@@ -242,12 +246,12 @@ def _rotation_planes(quats):
     ]
 
 
-def _times(rows, matrix):
+def _times(rows: Sequence[Planes], matrix: Sequence[Planes]) -> list[Planes]:
     return [[_dot(row, [matrix[i][j] for i in range(3)]) for j in range(3)] for row in rows]
 
 
 @jax.custom_vjp
-def _planes(columns):
+def _planes(columns: Array) -> Planes:
     """(g, c) -> c planes of (g,).
 
     The gradient joins the planes by selection. Autodiff's concatenation (or sum of padded planes) gets fused with the
@@ -257,7 +261,7 @@ def _planes(columns):
     return [columns[:, i] for i in range(columns.shape[1])]
 
 
-def _planes_bwd(_, planes):
+def _planes_bwd(_: None, planes: Planes) -> tuple[Array]:
     column = lax.broadcasted_iota(jnp.int32, (planes[0].shape[0], len(planes)), 1)
     joined = planes[0][:, None]
     for i, plane in enumerate(planes[1:], start=1):
@@ -268,16 +272,16 @@ def _planes_bwd(_, planes):
 _planes.defvjp(lambda columns: (_planes(columns), None), _planes_bwd)
 
 
-def _clamp_to_view(slope, focal, center, size, margin):
+def _clamp_to_view(slope: Array, focal: Array, center: Array, size: int, margin: float) -> Array:
     extra = margin * 0.5 * size / focal
     return jnp.clip(slope, -center / focal - extra, (size - center) / focal + extra)
 
 
-def _dot(a, b):
+def _dot(a: Planes | Array, b: Planes) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _all(conditions):
+def _all(conditions: Planes) -> Array:
     result = conditions[0]
     for condition in conditions[1:]:
         result &= condition

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
@@ -38,7 +39,7 @@ def render_reference(
 
 
 @jax.jit
-def _reference(gaussians, camera, background, config):
+def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
@@ -74,7 +75,7 @@ def _reference(gaussians, camera, background, config):
     return Rendering(color + transmittance[..., None] * background, alpha, depth, jnp.int32(0))
 
 
-def _project(gaussians, camera, config):
+def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple[Array, Array, Array, Array]:
     """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
 
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d I.
@@ -101,12 +102,12 @@ def _project(gaussians, camera, config):
     return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
 
 
-def _determinant(axes, eps2d):
+def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:
     """Determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix itself cancels in float64 too."""
     pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
     return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
 
 
-def _cross(a, b):
+def _cross(a: Array, b: Array) -> Array:
     """Cross products of the columns of two (..., 2, n): (..., n)."""
     return a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]

@@ -33,6 +33,8 @@ from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import (
+    Footprints,
+    Squares,
     TileGrid,
     count_pairs,
     depth_order,
@@ -159,7 +161,13 @@ def seen_from(
     return jnp.max(visibility, axis=0) >= threshold
 
 
-def _render(draw: Callable[..., Rendering], gaussians: Gaussians, cameras: Camera, config, background) -> Rendering:
+def _render(
+    draw: Callable[..., Rendering],
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str,
+    background: Background,
+) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
     config = splat_config(config)
@@ -178,17 +186,17 @@ def _render(draw: Callable[..., Rendering], gaussians: Gaussians, cameras: Camer
 
 
 @functools.cache
-def _jitted(draw):
+def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
     return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
 
 
-def _draw_image(gaussians, camera, background, config):
+def _draw_image(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig) -> Rendering:
     gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
     return draw(gaussians, camera, background, config)
 
 
 @jax.custom_vjp
-def _once_per_image(array, camera: Camera):
+def _once_per_image(array: Array, camera: Camera) -> Array:
     """The same array; where `vmap` shares it among cameras, each camera gets its own.
 
     Its gradient is then summed over the cameras once, and not at each of the dozen operations of the projection that mix
@@ -204,12 +212,12 @@ _once_per_image.defvjp(
 
 
 @jax.custom_batching.custom_vmap
-def _own(array, of):
+def _own(array: Array, of: Array) -> Array:
     return array
 
 
 @_own.def_vmap
-def _own_in_batch(size, batched, array, of):
+def _own_in_batch(size: int, batched: Sequence[bool], array: Array, of: Array) -> tuple[Array, bool]:
     return array if batched[0] else jnp.broadcast_to(array, (size, *array.shape)), True
 
 
@@ -223,7 +231,7 @@ def with_background(
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
 
-def _color(background, dtype):
+def _color(background: object, dtype: np.dtype) -> Array:
     if background is None:
         return jnp.ones(3, dtype)
     if isinstance(background, str):
@@ -269,7 +277,9 @@ def draw_views(gaussians: Gaussians, cameras: Camera, background: Float[Array, "
     return lax.map(lambda camera: draw(gaussians, camera, background, config), cameras)
 
 
-def _draw(projected, gaussians, camera, background, config: SplatConfig) -> Rendering:
+def _draw(
+    projected: ProjectedGaussians, gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig
+) -> Rendering:
     if config.scale != 1:
         small = dataclasses.replace(config, scale=1.0)
         drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small)
@@ -299,7 +309,9 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig) -> Rend
     return _blended(features, transmittance, grid, background, nearest, overflow, visibility)
 
 
-def _draw_tiles(footprints, splats, grid: TileGrid, config: SplatConfig):
+def _draw_tiles(
+    footprints: Footprints | Squares, splats: Array, grid: TileGrid, config: SplatConfig
+) -> tuple[Array, Array, Array, Array]:
     """Tiles of premultiplied features (t, 4, p) and the final T (t, 1, p), largest weights (g,), overflow.
 
     Footprints and splats in depth order.
@@ -311,7 +323,15 @@ def _draw_tiles(footprints, splats, grid: TileGrid, config: SplatConfig):
     return features, transmittance[:, None], lax.stop_gradient(peaks), pairs.overflow
 
 
-def _blended(features, transmittance, grid, background, nearest, overflow, visibility) -> Rendering:
+def _blended(
+    features: Array,
+    transmittance: Array,
+    grid: TileGrid,
+    background: Array,
+    nearest: Array | float,
+    overflow: Array,
+    visibility: Array | None,
+) -> Rendering:
     """features: (t, 4, p) premultiplied rgb and z - nearest. transmittance: (t, 1, p) the final one.
 
     Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor does its gradient.
@@ -332,7 +352,7 @@ def _resized(rendering: Rendering, camera: Camera) -> Rendering:
     return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility)
 
 
-def _resampled(image, size: int, axis: int):
+def _resampled(image: Array, size: int, axis: int) -> Array:
     """Linear interpolation between pixels along one axis, constant beyond the outer ones.
 
     As `jax.image.resize`, whose matrix products take 14 times as long on a CPU.
@@ -411,7 +431,7 @@ def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
         jax.debug.callback(warn, jnp.max(overflow, initial=0))
 
 
-def _warn(missing, max_pairs, max_rows):
+def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | None) -> None:
     if missing > 0:
         logger.warning(
             "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s, max_rows = %s. Larger buffers: "
@@ -422,7 +442,7 @@ def _warn(missing, max_pairs, max_rows):
         )
 
 
-def _needed(gaussians, cameras, config):
+def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
     """Most rows and most pairs that any of the views needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
     config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
@@ -430,7 +450,7 @@ def _needed(gaussians, cameras, config):
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _count(gaussians, cameras, config):
+def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Sequence[Array]:
     def one(camera):
         projected = project_gaussians(gaussians, camera, config)
         camera = drawn_camera(camera, config)

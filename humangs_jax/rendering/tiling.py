@@ -139,11 +139,11 @@ def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     return jnp.minimum(within + starts[:, None], SUM_LIMIT).reshape(-1)[:n]
 
 
-def _in_rows(x):
+def _in_rows(x: Int[Array, " n"]) -> Int[Array, "rows 64"]:
     return jnp.pad(x, (0, -x.shape[0] % _ROW)).reshape(-1, _ROW)
 
 
-def _sums_in_rows(rows):
+def _sums_in_rows(rows: Int[Array, "rows 64"]) -> Int[Array, "rows 64"]:
     """Running sums along each row, exact while they stay below 2^24."""
     triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
     return jnp.matmul(rows.astype(jnp.float32), triangle, precision=lax.Precision.HIGHEST).astype(jnp.int32)
@@ -325,7 +325,7 @@ class Squares(NamedTuple):
         """First and last tile of each square, the same in all its rows."""
         return self._range(self.x, grid.tile_size, grid.columns)
 
-    def _range(self, center, size, tiles):
+    def _range(self, center: Array, size: int, tiles: int) -> tuple[Array, Array]:
         low, high = center - 0.5 - self.radius, center - 0.5 + self.radius + size - 1
         first = jnp.clip(jnp.floor(low / size), 0, tiles)
         return first.astype(jnp.int32), (jnp.clip(jnp.floor(high / size), 0, tiles) - 1).astype(jnp.int32)
@@ -426,17 +426,17 @@ def emit_pairs(footprints: Footprints | Squares, grid: TileGrid, max_rows: int, 
     return Pairs(tiles, table[:, 1], needed, needed - jnp.minimum(pairs.needed, max_pairs))
 
 
-def _first(v, tile_size, tiles):
+def _first(v: Array, tile_size: int, tiles: int) -> Array:
     """First of `tiles` whose last pixel centre is not left of v."""
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(jnp.int32)
 
 
-def _last(v, tile_size, tiles):
+def _last(v: Array, tile_size: int, tiles: int) -> Array:
     """Last of `tiles` whose first pixel centre is not right of v."""
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 
-def _count_row_by_row(footprints, grid: TileGrid, most_rows):
+def _count_row_by_row(footprints: Footprints | Squares, grid: TileGrid, most_rows: Array) -> Array:
     """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
@@ -449,6 +449,6 @@ def _count_row_by_row(footprints, grid: TileGrid, most_rows):
     return lax.fori_loop(0, most_rows, count, jnp.zeros((), jnp.int32))
 
 
-def _saturating_sum(x):
+def _saturating_sum(x: Array) -> Array:
     fits = jnp.sum(x.astype(jnp.float32)) < SUM_LIMIT
     return jnp.where(fits, jnp.sum(x, dtype=jnp.int32), SUM_LIMIT)

@@ -126,7 +126,7 @@ def unpack(packed: Packed) -> dict[str, np.ndarray]:
     return {name: read(entry) for name, entry in entries}
 
 
-def _low_pass(avatar):
+def _low_pass(avatar: Avatar) -> float:
     """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
     return 0.0 if avatar.gaussians.low_pass is None else float(np.median(avatar.gaussians.low_pass))
 
@@ -158,14 +158,14 @@ def fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | N
     return betas if error < SHAPE_TOLERANCE else None
 
 
-def _other_values(avatar, motion):
+def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
     values = {name: (getattr(avatar, name), FINITE) for name in ("skinning_weights", "rest_vertices", "rest_joints")}
     if motion is not None:
         values |= {f"motion.{name}": (getattr(motion, name), FINITE) for name in ("rotations", "translations")}
     return values
 
 
-def _pack_gaussians(avatar, header, arrays):
+def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     g = avatar.gaussians
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
@@ -188,7 +188,7 @@ def _pack_gaussians(avatar, header, arrays):
         header["light_shading"], arrays["light_shading"] = _quantized(shading, shading.min(), shading.max())
 
 
-def _pack_shape(avatar, body, header, arrays):
+def _pack_shape(avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     """Of every direction its offsets of the vertices; the Gaussians of a vertex move with it (they are vertex-major)."""
     betas = fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
@@ -204,13 +204,15 @@ def _pack_shape(avatar, body, header, arrays):
     header["shape"] = {"names": names, "betas": betas.tolist(), "step": step}
 
 
-def _quantized(values, low, high):
+def _quantized(
+    values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
+) -> tuple[dict[str, Any], np.ndarray]:
     low, high = np.asarray(low), np.maximum(high, np.asarray(low) + SMALLEST_RANGE)
     whole = np.rint((values - low) / (high - low) * STEPS).astype("<u2")
     return {"low": low.tolist(), "high": high.tolist()}, whole
 
 
-def _joined(header, arrays) -> Packed:
+def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
     header["arrays"], parts, offset = {}, [], 0
     for name, array in arrays.items():
         data = np.ascontiguousarray(array).tobytes()

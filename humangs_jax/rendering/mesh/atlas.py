@@ -109,7 +109,7 @@ def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"])
     return image[rows, columns]
 
 
-def _adjacent(faces):
+def _adjacent(faces: np.ndarray) -> np.ndarray:
     """(p, 2) pairs of faces that share an edge."""
     edges = np.sort(edges_of(faces).astype(np.int64), axis=1)
     keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
@@ -118,7 +118,7 @@ def _adjacent(faces):
     return np.stack([order[same], order[same + 1]], 1) % len(faces)
 
 
-def _choose_sides(normals, pairs):
+def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """(f,) side of each face: the one it looks at, unless its neighbours agree on another that it can see as well."""
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
@@ -130,7 +130,7 @@ def _choose_sides(normals, pairs):
     return sides
 
 
-def _connected(count, pairs, labels):
+def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """(f,) index of the connected set of faces of one label that contains each face."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -140,7 +140,14 @@ def _connected(count, pairs, labels):
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def _flatten(vertices, faces, normals, charts, sides, density):
+def _flatten(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    charts: np.ndarray,
+    sides: np.ndarray,
+    density: np.ndarray,
+) -> _Flat:
     """Every chart in a plane across its mean normal, turned so that its box is small, as large as its density says."""
     count = int(charts.max()) + 1
     keys, inverse = np.unique(charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True)
@@ -163,7 +170,7 @@ def _flatten(vertices, faces, normals, charts, sides, density):
     return _Flat(points, heights, inverse.reshape(-1, 3), vertex, owner, charts)
 
 
-def _turned(flat, owner, count, angles=8):
+def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) -> np.ndarray:
     """Points (u, 2) with every chart turned by the one of a few angles that makes its bounding box smallest, wide side right."""
     best_area, best = np.full(count, np.inf), flat
     for angle in np.arange(angles) * (np.pi / angles):
@@ -177,19 +184,19 @@ def _turned(flat, owner, count, angles=8):
     return best
 
 
-def _extreme(function, values, owner, count):
+def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
     """(charts, 2) the least or greatest values (u, 2) of each chart."""
     result = np.full((count, 2), np.inf if function is np.minimum else -np.inf)
     function.at(result, owner, values)
     return result
 
 
-def _sizes(flat):
+def _sizes(flat: _Flat) -> np.ndarray:
     """Widths and heights of the charts, metres."""
     return _extreme(np.maximum, flat.points, flat.point_charts, int(flat.charts.max()) + 1).T
 
 
-def _hidden(flat: _Flat, size):
+def _hidden(flat: _Flat, size: int) -> np.ndarray:
     """(f,) faces that lie below others of their chart, where charts overlap themselves."""
     corners, scale = _shelves(flat, size)
     pixels = (flat.points * scale + corners[flat.point_charts]).astype(np.float32)
@@ -202,7 +209,7 @@ def _hidden(flat: _Flat, size):
     return hidden
 
 
-def _shelves(flat, size):
+def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
     """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of falling height."""
     width, height = _sizes(flat)
     order = np.argsort(-height)
@@ -220,7 +227,9 @@ def _shelves(flat, size):
         scale *= 0.95
 
 
-def _rasterize(pixels, depth, faces, size):
+def _rasterize(
+    pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
+) -> tuple[np.ndarray, np.ndarray]:
     """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on top."""
     points = np.stack([pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1)
     points = np.pad(points.astype(np.float32), ((0, -len(points) % VERTEX_STEP), (0, 0)), constant_values=1)
@@ -235,7 +244,7 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
     return _rasterize(atlas.uvs * atlas.size, np.float32(1), atlas.faces, atlas.size)
 
 
-def _pack(flat: _Flat, size) -> Atlas:
+def _pack(flat: _Flat, size: int) -> Atlas:
     """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
     scale = size / np.sqrt(
         np.prod(_sizes(flat), 0).sum()
@@ -246,7 +255,7 @@ def _pack(flat: _Flat, size) -> Atlas:
     return Atlas(uvs.astype(np.float32), flat.faces.astype(np.int32), flat.vertices, flat.charts, size, 1 / scale)
 
 
-def _place(flat, scale, size):
+def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
     """Corners (charts, 2) in texels, or None if the charts do not fit."""
     cell = size // CELLS
     masks = _bitmaps(flat, scale, cell)
@@ -264,7 +273,7 @@ def _place(flat, scale, size):
     return corners
 
 
-def _first_free(free, mask):
+def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
     """(row, column) at which all cells of a bitmap are free, the lowest one; None if there is none."""
     rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
     if rows < 1 or columns < 1:
@@ -276,7 +285,7 @@ def _first_free(free, mask):
     return divmod(place, columns) if fits.flat[place] else None
 
 
-def _bitmaps(flat, scale, cell):
+def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
     """For every chart the cells (rows, columns) that the boxes of its faces touch, half a gutter around them included."""
     corners = (flat.points * scale)[flat.faces]
     low = np.floor(corners.min(1) / cell).astype(np.int64)

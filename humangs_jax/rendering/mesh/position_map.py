@@ -58,7 +58,7 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
 
 
 @jax.jit
-def _light(albedo, points, normals, eye):
+def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
     """Phong's light at the vertices: ambient and diffuse times the albedo, and a white highlight."""
     dot = lambda a, b: jnp.sum(a * b, axis=-1, keepdims=True)
     nowhere = jnp.zeros(3)
@@ -70,6 +70,6 @@ def _light(albedo, points, normals, eye):
     return albedo * (AMBIENT + DIFFUSE * jnp.maximum(facing, 0)) + SPECULAR * highlight
 
 
-def _map(vertices, values, faces, camera, config):
+def _map(vertices: Array, values: Array, faces: Array, camera: Camera, config: RasterConfig) -> tuple[Array, Array]:
     fragments = rasterize_mesh(vertices, faces, camera, config)
     return interpolate_attributes(fragments, faces, values, jnp.full(3, BACKGROUND, values.dtype)), fragments.depth

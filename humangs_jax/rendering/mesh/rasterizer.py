@@ -23,6 +23,7 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
@@ -124,28 +125,28 @@ def interpolate_attributes(
     return jnp.where(covered[..., None], weight_a * a + weight_b * b + weight_c * c, background)
 
 
-def _project(vertices, camera):
+def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
     """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
     x, y, z = (R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i] for i in range(3))
     return jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z], axis=-1).astype(vertices.dtype)
 
 
-def _first_pixel(low, size):
+def _first_pixel(low: Array, size: int) -> Array:
     """First pixel whose centre is at `low` or after; clipped to [0, size]."""
     return jnp.clip(jnp.ceil(low - 0.5), 0, size).astype(jnp.int32)
 
 
-def _last_pixel(high, size):
+def _last_pixel(high: Array, size: int) -> Array:
     """Last pixel whose centre is at `high` or before; clipped to [-1, size - 1]."""
     return jnp.clip(jnp.floor(high - 0.5), -1, size - 1).astype(jnp.int32)
 
 
-def _pixel_centers(pixel, width, dtype):
+def _pixel_centers(pixel: Array, width: int, dtype: np.dtype) -> tuple[Array, Array]:
     return (pixel % width).astype(dtype) + 0.5, (pixel // width).astype(dtype) + 0.5
 
 
-def _drawn(corners, near):
+def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
     """Faces before the near plane that have an area in the image; and how many faces are left out that may be seen."""
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
@@ -156,7 +157,7 @@ def _drawn(corners, near):
     return whole & (area > rounding), jnp.sum(lost, dtype=jnp.int32)
 
 
-def _rows(corners, drawn, width, height):
+def _rows(corners: Float[Array, "f 9"], drawn: Array, width: int, height: int) -> tuple[Array, Array]:
     """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no pixel centre."""
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
@@ -164,7 +165,7 @@ def _rows(corners, drawn, width, height):
     return first, jnp.where(drawn, jnp.maximum(_last_pixel(y.max(-1), height) - first + 1, 0), 0)
 
 
-def _spans(corners, row, width):
+def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
     """First column and number of the pixel centres of this row that may lie inside the face."""
     y = row.astype(corners.dtype) + 0.5
     left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
@@ -182,7 +183,7 @@ def _spans(corners, row, width):
     return first, jnp.maximum(_last_pixel(right + slack, width) - first + 1, 0)
 
 
-def _weigh(corners, x, y):
+def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Array]:
     """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x, y)."""
     corner_x, corner_y = [corners[..., 3 * i] for i in range(3)], [corners[..., 3 * i + 1] for i in range(3)]
     edges = []
@@ -204,7 +205,7 @@ def _weigh(corners, x, y):
     return [value * depth for value in over_z], depth, inside
 
 
-def _weights_by_pixel(corners, face_ids, width, pixels_per_step):
+def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_step: int) -> Array:
     """(h w, 3) weights of the corners of each pixel's face. In steps: small buffers are several times faster on CPU."""
 
     def weights(pixel_and_face):
@@ -215,14 +216,22 @@ def _weights_by_pixel(corners, face_ids, width, pixels_per_step):
     return lax.map(weights, (pixels, face_ids), batch_size=pixels_per_step)
 
 
-def _window(first, end, start, size):
+def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, Array, Array]:
     """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not."""
     item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
     return item, slot - first[item], slot < end[-1]
 
 
-def _z_buffer(corners, first_row, row_begin, row_end, width, height, config):
+def _z_buffer(
+    corners: Array,
+    first_row: Array,
+    row_begin: Array,
+    row_end: Array,
+    width: int,
+    height: int,
+    config: RasterConfig,
+) -> tuple[Array, Array]:
     """Depth and face of every pixel (h w): infinity and NO_FACE where there is none."""
 
     def draw_rows(state):
