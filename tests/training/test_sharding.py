@@ -50,6 +50,7 @@ def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
         np.testing.assert_allclose(np.concatenate(divided[data], axis=1), mean, rtol=1e-5)
 
 
+@pytest.mark.parametrize("given", [("localhost:1234", None, None), ("localhost:1234", 2, None), (None, 2, 0)])
 def test_half_of_an_address_is_refused(given):
     with pytest.raises(ValueError, match="give coordinator, number of processes and process index, or none"):
         join_processes(*given)
