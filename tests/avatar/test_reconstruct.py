@@ -124,7 +124,7 @@ def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
     count = len(body.template)
     means = body.template + jnp.asarray(rng.normal(size=(count, 3)) * 0.1 * (rng.random((count, 1)) < 0.2), jnp.float32)
     gaussians = Gaussians(means, jnp.ones((count, 4)), jnp.ones((count, 3)), jnp.ones(count), jnp.ones((count, 3)))
-    outputs = HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3)), None, jnp.zeros((), int), jnp.zeros((), int))
+    outputs = HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3)))
     avatar = make_avatar(outputs, body, jnp.zeros(4), tiny())
     spread = with_spread_weights(avatar, pose, 0.04)
     changed = np.any(spread.skinning_weights != avatar.skinning_weights, axis=1)
