@@ -125,7 +125,7 @@ def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
     means = body.template + jnp.asarray(rng.normal(size=(count, 3)) * 0.1 * (rng.random((count, 1)) < 0.2), jnp.float32)
     gaussians = Gaussians(means, jnp.ones((count, 4)), jnp.ones((count, 3)), jnp.ones(count), jnp.ones((count, 3)))
     outputs = HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3)))
-    avatar = make_avatar(outputs, body, jnp.zeros(4), tiny())
+    avatar = make_avatar(outputs, body, shape_body(body, jnp.zeros(4)), tiny())
     spread = with_spread_weights(avatar, pose, 0.04)
     changed = np.any(spread.skinning_weights != avatar.skinning_weights, axis=1)
     assert 0.05 < changed.mean() <= 0.25 and not changed[np.linalg.norm(means - body.template, axis=1) < 0.03].any()
@@ -215,7 +215,7 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
     count, pose = len(body.template), BodyPose(views.rotations[0], views.translations[0])
     sizes, quats = ((count, 3), (count,), (count, 3)), jnp.tile(jnp.eye(4)[0], (count, 1))
     outputs = HumanGSOutputs(Gaussians(body.template, quats, *(jnp.full(size, 0.01) for size in sizes)))
-    moved = [skin(make_avatar(outputs, x, views.betas, config), pose) for x in (corrected, body)]
+    moved = [skin(make_avatar(outputs, x, shape_body(x, views.betas), config), pose) for x in (corrected, body)]
     np.testing.assert_array_equal(moved[0].means, moved[1].means)
 
 

@@ -17,7 +17,7 @@ from experiments.systems.surface_gaussians import PoseAttention, PoseMapDriver, 
 from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.targets import PixelDriver, target_queries
 from humangs_jax.avatar.reconstruct import make_avatar
-from humangs_jax.body.model import BodyPose, person_vertices
+from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
@@ -184,7 +184,7 @@ def test_a_network_that_draws_pixels_makes_no_avatar():
     config = small("lvsm")
     outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lvsm"), config)[0], random_variables(config))
     with pytest.raises(ValueError, match="PhotoDecoder draws images without Gaussians"):
-        make_avatar(outputs, tube(), BETAS, config)
+        make_avatar(outputs, tube(), shape_body(tube(), BETAS), config)
 
 
 # Drivers -------------------------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_texels_lie_on_the_surface_and_empty_ones_are_transparent(name):
     np.testing.assert_allclose(outputs.gaussians.means[covered], surface[covered], atol=1e-6)
     for gaussians in (frame.gaussians, outputs.gaussians):
         assert not gaussians.opacities[~covered].any() and (gaussians.opacities[covered] > 0).all()
-    avatar = make_avatar(frame, body, BETAS, small(name))
+    avatar = make_avatar(frame, body, shape_body(body, BETAS), small(name))
     np.testing.assert_allclose(avatar.skinning_weights.sum(axis=1), 1, atol=1e-6)
     expected = np.einsum("tk,tkj->tj", weights, np.asarray(body.skinning_weights)[corners])
     np.testing.assert_allclose(avatar.skinning_weights[covered], expected[covered], atol=1e-6)
