@@ -150,7 +150,7 @@ def _late_cameras(photos, keypoints):
         by[list(late)] = list(late.values())
         views = view_at[camera_of, np.asarray(photos.frames) + MOST_LATE + by[camera_of]]
         confidences = np.where(views[:, None] < 0, 0.0, keypoints.confidences[views])
-        return dataclasses.replace(keypoints, points=keypoints.points[views], confidences=confidences)
+        return dataclasses.replace(keypoints, points=keypoints.points[views], confidences=confidences, world=None)
 
     def look(late):
         return _Seen.of(photos, shifted(late), edge=MOST_LATE)

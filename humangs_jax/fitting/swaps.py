@@ -164,7 +164,10 @@ def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: O
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
     pick = lambda values: jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
-    return replace(observations, points=pick(observations.points), confidences=pick(observations.confidences))
+    world = None if observations.world is None else pick(observations.world)
+    return replace(
+        observations, points=pick(observations.points), confidences=pick(observations.confidences), world=world
+    )
 
 
 class Agreement(NamedTuple):

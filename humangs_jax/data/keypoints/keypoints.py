@@ -26,7 +26,8 @@ class Keypoints:
     points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5, 0.5); finite, and to be
         ignored where the confidence is 0.
     confidences: (v, k) float32 in [0, 1]; 0: the point is missing.
-    set: what the k points are. missing: names of the views that the file has nothing for.
+    set: what the k points are. world: (v, k, 3) metres, where the detector has said it: a person of average size, in axes whose z
+        is the ray to the person, up to a translation. missing: names of the views that the file has nothing for.
     not_finite: points that were NaN or infinite in the file. far_outside: points more than half an image outside of it.
         Both kinds have confidence 0.
     shifted: an image and its view, where they are counted from different numbers and were matched in order; else "".
@@ -39,6 +40,7 @@ class Keypoints:
     not_finite: int = 0
     far_outside: int = 0
     shifted: str = ""
+    world: Float[np.ndarray, "v k 3"] | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -66,12 +68,13 @@ class DetectedImage:
 
     image: its name or path as the file has it, or a number where the file has no more.
     file: that the people are from. size: (width, height) in pixels where the file states it.
-    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and null are NaN.
+    people: each (k, 3): x and y in pixels of the tool, confidence; not yet checked, so that NaN and null are NaN. Or (k, 6), with
+        `Keypoints.world`.
     """
 
     image: str | int
     file: Path
-    people: tuple[Float[np.ndarray, "k 3"], ...]
+    people: tuple[Float[np.ndarray, "k columns"], ...]
     size: tuple[int, int] | None = None
 
 

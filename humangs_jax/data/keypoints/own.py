@@ -43,8 +43,9 @@ def read(source: Source, format: SourceFormat) -> Detections:
     if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
     kind, images = read_people(source.path, source.json)
-    nobody = np.zeros((len(kind.names), 3))
-    found = (tuple(nobody if each is None else each.points for each in image.people) for image in images)
+    nobody = np.zeros((len(kind.names), 6))
+    columns = lambda each: nobody if each is None else np.column_stack([each.points, each.world])
+    found = (tuple(map(columns, image.people)) for image in images)
     seen = tuple(DetectedImage(i.image, source.path, p, i.size) for i, p in zip(images, found, strict=True))
     return Detections(kind if any(any(image.people) for image in images) else None, seen, offset=0.0)
 

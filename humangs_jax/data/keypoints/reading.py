@@ -34,9 +34,11 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".h
 
 
 class Person(NamedTuple):
-    """values: (k, 3) pixels with centres at +0.5, finite, and confidences in [0, 1]. Counts as in `Keypoints`."""
+    """values: (k, 3) pixels with centres at +0.5, finite, and confidences in [0, 1], or (k, 6) with `Keypoints.world`. Counts as
+    there.
+    """
 
-    values: Float[np.ndarray, "k 3"]
+    values: Float[np.ndarray, "k columns"]
     not_finite: int = 0
     far_outside: int = 0
 
@@ -119,7 +121,8 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
     body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
-    people, most, nobody = [], 0, Person(np.zeros((len(kind.names), 3)))
+    columns = max((each.shape[1] for image in detections.images for each in image.people), default=3)
+    people, most, nobody = [], 0, Person(np.zeros((len(kind.names), columns)))
     for image, name in zip(images, names, strict=True):
         seen = () if image is None else image.people
         found = [_usable(each, detections.offset, width, height, image, name) for each in seen if image is not None]
@@ -147,6 +150,7 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         not_finite=sum(each.not_finite for each in people),
         far_outside=sum(each.far_outside for each in people),
         shifted=_shifted(images, names),
+        world=values[..., 3:] if columns > 3 else None,
     )
     _check_pixels(path, keypoints)
     return keypoints
@@ -210,7 +214,7 @@ def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
 
 
 def _usable(
-    values: Float[np.ndarray, "k 3"], offset: float, width: int, height: int, image: DetectedImage, view: str
+    values: Float[np.ndarray, "k columns"], offset: float, width: int, height: int, image: DetectedImage, view: str
 ) -> Person:
     """Raises: CaptureError if confidences are not in [0, 1]."""
     finite = np.logical_and.reduce(np.isfinite(values), axis=1)
@@ -221,7 +225,7 @@ def _usable(
     values = np.where(finite[:, None], np.clip(values, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
     points, confidences = values[:, :2] + offset, np.clip(values[:, 2], 0, 1)
     far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
-    usable = np.column_stack([points, np.where(far, 0, confidences)])
+    usable = np.column_stack([points, np.where(far, 0, confidences), values[:, 3:]])
     return Person(usable, int((~finite).sum()), int(far.sum()))
 
 

@@ -14,6 +14,7 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.solve import robust
 from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of
+from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.transform import EXACT
 
 NEAR = 0.05
@@ -26,6 +27,8 @@ NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
 """Metres: how far from where they are thought to be detectors see landmarks."""
+WORLD_STD = 0.15
+"""Of a detector's 3D landmarks, over the root mean square of their distances from their middle."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a vector whose two components have a std of 1."""
 
@@ -35,7 +38,8 @@ class Observations(Batchable):
     """Keypoints of one frame in c views; a missing view has confidence 0.
 
     points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3, 3) pixels.
-    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels.
+    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels. world: (c, k, 3) where the detector sees the
+    landmarks in space, in the camera's axes, up to a translation and a scale.
     """
 
     points: Float[Array, "c k 2"]
@@ -43,14 +47,18 @@ class Observations(Batchable):
     K: Float[Array, "c 3 3"]
     cam_from_world: Float[Array, "c 4 4"]
     noise: Float[Array, ""]
+    world: Float[Array, "c k 3"] | None = None
 
 
-def make_observations(points, confidences, K, cam_from_world) -> Observations:
+def make_observations(points, confidences, K, cam_from_world, world=None) -> Observations:
     """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
-    return jax.vmap(Observations)(
-        *(jnp.asarray(x, jnp.float32) for x in (points, confidences, K, cam_from_world, noise))
+    given = (
+        (points, confidences, K, cam_from_world, noise)
+        if world is None
+        else (points, confidences, K, cam_from_world, noise, world)
     )
+    return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
 
 
 def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
@@ -63,7 +71,25 @@ def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Obse
     confidences = np.where(views[..., None] < 0, 0.0, keypoints.confidences[views])
     points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
     cameras = photos.cameras
-    return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views]), views
+    world = None
+    if keypoints.world is not None and views.shape[1] == 1:  # several views say more than any of them alone
+        world = _in_camera_axes(keypoints.world[views], points, confidences, np.asarray(cameras.K)[views])
+    return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views], world), views
+
+
+def _in_camera_axes(
+    world: Float[np.ndarray, "m c k 3"],
+    points: Float[np.ndarray, "m c k 2"],
+    confidences: Float[np.ndarray, "m c k"],
+    K: Float[np.ndarray, "m c 3 3"],
+) -> Float[np.ndarray, "m c k 3"]:
+    """Landmarks whose z axis is the ray to the person, in the axes of the camera."""
+    middle = (confidences[..., None] * points).sum(-2) / np.maximum(confidences.sum(-1), 1e-9)[..., None]
+    focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
+    seen = confidences.sum(-1, keepdims=True) > 0
+    rays = np.concatenate([np.where(seen, (middle - center) / focal, 0), np.ones((*seen.shape[:-1], 1))], axis=-1)
+    turns = smallest_turns(np.asarray([0.0, 0.0, 1.0]), rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    return np.einsum("mcab,mckb->mcka", turns, world)
 
 
 def expected_noise(
@@ -127,6 +153,23 @@ def keypoint_residuals(
     )
 
 
+def world_residuals(
+    model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
+) -> Float[Array, "c k"]:
+    """Depths of landmarks against those that the detector sees, of a person of the same size, in standard deviations."""
+    weights = observations.confidences * np.asarray(model.known, np.float32)
+    centered = lambda x: x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
+    size = lambda x: jnp.sqrt(jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total + NEAR**2)[:, None]
+    total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
+    ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
+    errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
+    known = weights > 0
+    return (
+        jnp.where(known, jnp.sqrt(jnp.where(known, weights, 1.0)), 0.0)
+        * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
+    )
+
+
 @pytree_dataclass
 class Targets:
     """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per pixel there."""
@@ -174,6 +217,8 @@ def frame_residuals(
         "limits": limit_residuals(problem.prior, problem.origin.joints, pose.rotations),
         "shape": state.betas,
     }
+    if observations.world is not None:
+        found["world"] = world_residuals(problem.model, observations, landmarks, scale)
     if targets is not None:
         known = (targets.known * problem.known)[:, None]
         found["points"] = known * robust((landmarks - targets.points) / (targets.pixel * observations.noise), scale)
