@@ -78,10 +78,14 @@ def without_calibration(
     keypoints = frame.keypoints
     order = np.where(found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names)))
     pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
-    keypoints = dataclasses.replace(keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences))
-    return frame._replace(
-        cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world), moments=found.moments > 1
+    world = pick(frame.world)
+    keypoints = dataclasses.replace(
+        keypoints,
+        points=pick(keypoints.points),
+        confidences=pick(keypoints.confidences),
+        world=world.astype(np.float32),
     )
+    return frame._replace(cameras=stack_cameras(cameras), keypoints=keypoints, world=world, moments=found.moments > 1)
 
 
 def one_view_each(frames: Sequence[RealFrame]) -> RealFrame:

@@ -115,10 +115,11 @@ def person_in_capture(
 
 def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
     """The keypoints of a person; of photos without the person, none."""
-    nobody = np.zeros((len(MEDIAPIPE_33.names), 3))
-    found = [nobody if (each := photo.people[person]) is None else each.person.points for photo in photos]
+    nobody = np.zeros((len(MEDIAPIPE_33.names), 6))
+    seen = [photo.people[person] for photo in photos]
+    found = [nobody if each is None else np.column_stack([each.person.points, each.person.world]) for each in seen]
     points = np.asarray(found, np.float32)
-    return Keypoints(points[..., :2], points[..., 2], MEDIAPIPE_33)
+    return Keypoints(points[..., :2], points[..., 2], MEDIAPIPE_33, world=points[..., 3:])
 
 
 def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
