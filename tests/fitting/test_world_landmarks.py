@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from fitting.fit_people import betas_of, model_of, observe, rotations_of
 
 from humangs_jax.body.landmarks import pose_landmarks
@@ -25,6 +26,7 @@ def seen_in_space(model, observations, seed):
     return 0.9 * turned + 3.0 + np.random.default_rng(seed).normal(0, NOISE, turned.shape)
 
 
+@pytest.mark.slow
 def test_of_one_view_depths_are_better_where_the_detector_sees_them():
     model, seed = model_of(), 3
     joints, _, seen = observe(POSES, seed=seed, views=1, noise=1.0)
