@@ -142,13 +142,13 @@ KEYPOINTS = SourceFormats(
         "COCO, COCO-WholeBody or AlphaPose",
         _KEYPOINTS + "coco:read",
         files=("alphapose-results.json", "alphapose.json"),
-        content="results, or images and annotations: 17 or 133 points",
+        content="results, or images and annotations: 17, 26 or 133 points",
     ),
     mmpose=SourceFormat(
         "MMPose",
         _KEYPOINTS + "mmpose:read",
         files=("rtmpose", "mmpose", "predictions"),
-        content="inferencer or demo scripts, a file an image or a video: 17 or 133 points",
+        content="inferencer or demo scripts, a file an image or a video: 17, 26 or 133 points",
     ),
 )
 """Keypoints of detectors; files may be folders."""

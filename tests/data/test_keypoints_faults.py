@@ -147,7 +147,10 @@ FAULTS = {
     "empty list": ([], r"nobody in any of its images"),
     "empty": ("", r"not valid JSON"),
     "nobody": ({"version": 1.3, "people": []}, r"nobody in any of its images"),
-    "halpe": ([entry(count=26)], r"keypoints: expected 17 \(coco17\) or 133 \(wholebody133\) points, got 26"),
+    "another": (
+        [entry(count=27)],
+        r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) points, got 27",
+    ),
     "two sets": ([entry(), entry("back", count=133)], r"image back: a person of 133 points, but another has 17"),
     "no triples": ([{"image_id": "front", "keypoints": [1.0] * 50}], r"\[0\]\.keypoints: expected a flat list of"),
     "text": ([changed(0, "1")], r"\[0\]\.keypoints: expected numbers"),
@@ -233,8 +236,8 @@ OWN = {
         ({"points": None}, r"points: missing"),
         ({"names": np.array([{}, {}])}, r"names: a pickled object"),
         (
-            {"set": np.array("halpe26")},
-            r"set: expected one of coco17, wholebody133, openpose67, mediapipe33, got 'halpe26'",
+            {"set": np.array("halpe27")},
+            r"set: expected one of coco17, halpe26, wholebody133, openpose67, mediapipe33, got 'halpe27'",
         ),
         ({"points": np.ones((2, 133, 2))}, r"points: expected shape \(2, 17, 2\), got \(2, 133, 2\)"),
         ({"confidences": np.ones((1, 17))}, r"confidences: expected shape \(2, 17\)"),

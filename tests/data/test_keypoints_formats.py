@@ -9,7 +9,14 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, read_people, save_keypoints, write_people
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, MEDIAPIPE_33, OPENPOSE_67
+from humangs_jax.data.keypoints.sets import (
+    COCO_17,
+    COCO_WHOLEBODY_133,
+    HALPE_26,
+    KEYPOINT_SETS,
+    MEDIAPIPE_33,
+    OPENPOSE_67,
+)
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
 CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")
@@ -92,6 +99,11 @@ FOLDERS = {
         CAMERA_NAMES,
         lambda v: {f"cam{c}/{f:06d}_keypoints": openpose(openpose_person(x)) for c, f, x in OF_CAMERAS(v)},
     ),
+    "RTMPose's Halpe in OpenPose's form": (
+        HALPE_26,
+        ("front",),
+        lambda v: {"front": openpose({"person_id": [-1], "pose_keypoints_2d": flat(v[0])})},
+    ),
     "OpenPose of one image": (OPENPOSE_67, ("front",), lambda v: {"front_keypoints": openpose(openpose_person(v[0]))}),
     "MMPose": (COCO_17, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
     "MMPose, whole body": (COCO_WHOLEBODY_133, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
@@ -142,7 +154,7 @@ def test_nobody_is_found_in_a_view(tool, tmp_path):
 # COCO ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("keypoint_set", [COCO_17, COCO_WHOLEBODY_133])
+@pytest.mark.parametrize("keypoint_set", [COCO_17, HALPE_26, COCO_WHOLEBODY_133])
 @pytest.mark.parametrize("key", ["image_id", "file_name"])
 def test_coco_results_and_alphapose_by_name(tmp_path, keypoint_set, key):
     values = known(len(keypoint_set.names))

@@ -3,15 +3,15 @@
 The names, for `side` left or right (the person's own):
 
 nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
-    middle of the shoulders and of the hips, OpenPose only)
+    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe)
 `side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
 face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
 `side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
 
 A point has the same name in every set that has it, though annotators of different sets do not mean quite the same by "hip".
 
-Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data format; OpenPose's "Demo - Output" page; MediaPipe's
-"Pose landmark detection" page.
+Sources: COCO's person_keypoints annotations; Fang-Haoshu/Halpe-FullBody; jin-s13/COCO-WholeBody's data format; OpenPose's
+"Demo - Output" page; MediaPipe's "Pose landmark detection" page.
 """
 
 import dataclasses
@@ -108,6 +108,11 @@ COCO_WHOLEBODY_133 = _keypoint_set(
 )
 """COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
 
+HALPE_26 = _keypoint_set(
+    "halpe26", (*_COCO, "head_top", "neck", "mid_hip", *(f"{side}_{part}" for part in _FOOT for side in SIDES))
+)
+"""Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
+
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
@@ -147,7 +152,7 @@ MEDIAPIPE_33 = _keypoint_set(
 )
 """MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
 
-KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67, MEDIAPIPE_33)}
+KEYPOINT_SETS = {each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, OPENPOSE_67, MEDIAPIPE_33)}
 """The sets by name, as our npz files name them."""
-SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, COCO_WHOLEBODY_133)}
+SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133)}
 """The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
