@@ -150,7 +150,7 @@ class Refine:
     limit: str = "15s"
     """How long: seconds ("15s"), steps ("100steps") or iterations alone ("0steps"), after a compilation of some seconds."""
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
-    """Rounds of the learned update before the steps; 0: steps alone."""
+    """Iterations of the learned update before the steps; 0: steps alone."""
     image_size: Side | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False

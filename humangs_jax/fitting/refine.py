@@ -1,8 +1,7 @@
 """Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is better.
 
-Iterations are similar to iterated closest points: each draws the body, matches its silhouette with the mask's, and moves
-cameras, shape and poses by a few steps of damped least squares. The reach falls from one to the next. `StateStd` is a Gaussian
-prior around the start; without it cameras and people that move together would look the same, and silhouettes hardly show twists.
+As in iterated closest points, each iteration matches the rendered silhouette with the mask's and solves a few steps of damped least
+squares. `StateStd` is a Gaussian prior around the start: cameras and people that move together would look the same without it.
 """
 
 import dataclasses
@@ -230,7 +229,7 @@ def solve_round(
     return solve(residuals, state, steps, method="lm")
 
 
-# Rounds --------------------------------------------------------------------------------------------------------------
+# Iterations ----------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -439,9 +438,6 @@ def _check(capture, keypoints):
         raise CaptureError(
             "capture", "masks", "none shows anybody, and there are no keypoints: refinement needs one or the other"
         )
-
-
-# The report ----------------------------------------------------------------------------------------------------------
 
 
 def _better(found, before, most_worse):
