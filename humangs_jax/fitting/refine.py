@@ -1,7 +1,7 @@
 """Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is better.
 
 As in iterated closest points, each iteration matches the rendered silhouette with the mask's and solves a few steps of damped
-least squares. `StateStd` is a Gaussian prior around the start: cameras and people that move together would look the same without it.
+least squares. `StateStd` is a Gaussian prior around the start: without it cameras and people could move together.
 """
 
 import dataclasses
