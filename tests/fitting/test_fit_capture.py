@@ -76,7 +76,7 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     kind, own = record.keypoints.set, fitted.record.keypoints.set
     np.testing.assert_allclose(kind.certainty, own.certainty, rtol=1e-6)
     np.testing.assert_allclose(kind.offsets, own.offsets, atol=1e-7)
-    with pytest.raises(ValueError, match=r"body\.npz exists: --overwrite"):
+    with pytest.raises(ValueError, match=r"body\.npz exists"):
         check_place(path, None, overwrite=False)
     check_place(path, None, overwrite=True)
 
