@@ -154,12 +154,12 @@ VIEWS, SIZE = 4, 256
 COLUMNS = {
     "true_psnr": "PSNR, true parameters",
     "fitted_psnr": "PSNR, fitted",
-    "true_foreground": "on the person, true",
-    "fitted_foreground": "on the person, fitted",
+    "true_foreground": "foreground PSNR, true",
+    "fitted_foreground": "foreground PSNR, fitted",
     "true_refined_psnr": "PSNR, true, refined",
     "fitted_refined_psnr": "PSNR, fitted, refined",
-    "true_refined_foreground": "on the person, true, refined",
-    "fitted_refined_foreground": "on the person, fitted, refined",
+    "true_refined_foreground": "foreground PSNR, true, refined",
+    "fitted_refined_foreground": "foreground PSNR, fitted, refined",
     "joints_mm": "joint error, mm",
 }
 

@@ -36,9 +36,9 @@ MOTION_WINDOW = (480, 600)
 KEPT_WEIGHTS = (2, 4, 6, 8)
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
-    ("on the person, dB", "person"),
+    ("foreground PSNR, dB", "person"),
     ("after 100 frames of motion, dB", "motion_whole"),
-    ("on the person, dB", "motion_person"),
+    ("foreground PSNR, dB", "motion_person"),
 )
 
 

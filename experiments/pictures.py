@@ -11,7 +11,7 @@ from humangs_jax.avatar.sheets import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import to_uint8, write_png
 
-TRIPLE = ("truth", "ours", "painted body")
+TRIPLE = ("truth", "ours", "vertex-color baseline")
 CROP = 0.75
 """Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
 TITLE = 22
@@ -21,7 +21,7 @@ DETAILS = {"face": (("left_eye", "right_eye"), 0.3), "hand": (("left_middle1", "
 """What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
 DETAIL_PIXELS = 96
 Strip = dict[str, np.ndarray]
-"""By task: truth, ours and the painted body of the first held-out view, (3, h, w, 3) of 8 bits."""
+"""By task: truth, ours and the vertex-color baseline of the first held-out view, (3, h, w, 3) of 8 bits."""
 
 
 def strip_of(drawn: Drawn, held_out: Capture) -> Strip:

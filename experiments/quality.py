@@ -61,10 +61,10 @@ COLUMNS = {  # heading and digits
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 4),
     "psnr_fg": ("foreground PSNR", 2),
-    "baseline_psnr": ("painted body: PSNR", 2),
+    "baseline_psnr": ("vertex-color baseline: PSNR", 2),
     "baseline_ssim": ("SSIM", 3),
     "baseline_lpips": ("LPIPS", 4),
-    "baseline_psnr_fg": ("on the person", 2),
+    "baseline_psnr_fg": ("foreground PSNR", 2),
 }
 EXTREMES = 5
 """People at either end who are shown."""
@@ -113,7 +113,7 @@ def evaluation_views(
         strips = {seed: run.pictures.get(f"{seed}, {chosen} photos") for seed in (*shown[0], *shown[1])}
         strips = {seed: strip or measure(seed, chosen)[1] for seed, strip in strips.items()}
         write_sheet(images, shown, by_views[chosen], strips)
-        section += f"\n\n![The best people beside the worst: truth, ours, painted body]({link(images)})"
+        section += f"\n\n![The best people beside the worst: truth, ours, vertex-color baseline]({link(images)})"
     numbers = {n: means(list(row.values())) for n, row in by_views.items()}
     run.show(section, {"views": chosen, "by_views": numbers, "settings": start.settings, "people": len(start.seeds)})
 
@@ -130,7 +130,7 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
     best, worst = extremes(by_views[chosen])
     header, ends = ["", "seed"], []
     for task in tasks:
-        header += [f"{TASKS[task]}: PSNR", "on the person", "painted body"]
+        header += [f"{TASKS[task]}: PSNR", "foreground PSNR", "vertex-color baseline"]
     for name, seeds in (("best", best), ("worst", worst)):
         for place, seed in enumerate(seeds, 1):
             numbers = [cells(by_views[chosen][seed][task], ("psnr", "psnr_fg", "baseline_psnr")) for task in tasks]
@@ -159,7 +159,7 @@ def extremes(rows: dict[int, Any]) -> tuple[list[int], list[int]]:
 
 
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
-    """Whether more photos are ever worse, and how many people beat their painted body."""
+    """Whether more photos are ever worse, and how many people beat their vertex-color baseline."""
     mean = [(n, float(np.mean([row[task]["psnr"] for row in rows.values()]))) for n, rows in by_views.items()]
     worse = [
         f"by {x - y:.2f} dB from {few} to {many} photos" for (few, x), (many, y) in itertools.pairwise(mean) if y < x
@@ -169,16 +169,16 @@ def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
     whole, person = (sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg"))
     return (
         f"{TASKS[task].capitalize()}: {said}; with {chosen}, {whole} of {len(rows)} people have a higher PSNR than "
-        f"their painted body, {person} on the person alone."
+        f"their vertex-color baseline, {person} in the foreground alone."
     )
 
 
 def plot_views(path: Path, mean: dict[int, Any]) -> None:
-    """PSNR of the whole image and on the person against the number of photos, ours and the painted body."""
+    """PSNR of the whole image and of the foreground against the number of photos, ours and the vertex-color baseline."""
     with figure(path, 2, legend=0.15) as axes:
-        for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole picture", "on the person"), strict=True):
+        for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole picture", "foreground PSNR"), strict=True):
             for color, task in enumerate(TASKS):
-                for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "painted body")):
+                for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "vertex-color baseline")):
                     values = [tasks[task][prefix + key] for tasks in mean.values() if task in tasks]
                     label = f"{name}: {TASKS[task]}"
                     axis.plot(list(mean)[: len(values)], values, style, ms=4, color=f"C{color}", label=label)
@@ -200,7 +200,7 @@ def light(run: Run, people: People = People(16), sheet: Path | None = None) -> N
     photos of one pose: the best that an avatar with fixed colors can do.
 
     Options:
-    sheet: JPEG of an unseen pose of every person: truth, without and with the light
+    sheet: JPEG of an novel pose of every person: truth, without and with the light
     """
     start = people.start()
     cases = {str(seed): functools.partial(_light_of, start, seed) for seed in start.seeds}
@@ -211,14 +211,14 @@ def light(run: Run, people: People = People(16), sheet: Path | None = None) -> N
     for name, tasks in mean.items():
         photos, avatar, lit = name.split(", ") if ", " in name else ("", "true surface, fixed colors", "")
         rows.append([photos, avatar, lit, *(shown(tasks["novel"]) if photos else ["", ""]), *shown(tasks["animation"])])
-    scores = ["poses of the photos: PSNR", "on the person", "unseen poses: PSNR", "on the person"]
+    scores = ["poses of the photos: PSNR", "foreground PSNR", "novel poses: PSNR", "foreground PSNR"]
     table = markdown_table(["photos of", "avatar", "light", *scores], rows, "lllrrrr")
     about = f"Means over {len(start.seeds)} people of the {people.split} seeds, four photos of {people.size} px; dB."
     run.show(f"{about}\n\n{table}", {"settings": start.settings, "means": mean})
 
 
 def _light_of(start, seed):
-    """Scores by avatar and task of one person; an unseen pose, true, and after the iterations without and with the light."""
+    """Scores by avatar and task of one person; an novel pose, true, and after the iterations without and with the light."""
     subject, rng = make_subject(seed, start.body), np.random.default_rng([seed, RING])
     posed = [sample_pose(subject, i) for i in range(LIGHT_POSES)]
     rings = [cameras_around(rng, pose.vertices, spread_azimuths(rng, RING), start.size) for pose in posed]
@@ -285,7 +285,7 @@ def masks(run: Run, people: People = People(8), sheet: Path | None = None) -> No
     rows = [["exact", "photos on white", *both("exact")]]
     for error in ERRORS:
         rows += [[f"{error:+d}" if error else "0", how, *both(f"{error}, {how}")] for how in ("as they are", "moved")]
-    header = ["masks, pixels of 256", "used", *AVATARS, *(f"on the person, {avatar}" for avatar in AVATARS)]
+    header = ["masks, pixels of 256", "used", *AVATARS, *(f"foreground PSNR, {avatar}" for avatar in AVATARS)]
     about = f"Means over {len(start.seeds)} people of the {people.split} seeds, {PHOTOS} photos of {people.size} px; PSNR in dB."
     run.show(f"{about}\n\n{markdown_table(header, rows, 'llrrrr')}", {"settings": settings, "means": mean})
 
@@ -366,7 +366,9 @@ def evaluation_view_selection(run: Run, subjects: int = 8, count: int = 4) -> No
         f"{DRAWS} random choices each. The chosen ones are better for {better} of {len(rows)}; choosing takes "
         f"{np.median([row['seconds'] for row in rows]):.2f} s."
     )
-    run.show(f"{about}\n\n{markdown_table(['photos', 'PSNR, dB', 'on the person, dB'], table, 'lrr')}", {"means": mean})
+    run.show(
+        f"{about}\n\n{markdown_table(['photos', 'PSNR, dB', 'foreground PSNR, dB'], table, 'lrr')}", {"means": mean}
+    )
 
 
 def _choices_of(seed, count):

@@ -26,7 +26,7 @@ DEGREES, SHAPES = 0.2, 0.02
 """Of --off: turn of a joint and change of a shape coefficient (standard deviations) for each millimetre."""
 SHOWN = {
     "psnr": ("PSNR", 2),
-    "psnr_fg": ("on the person", 2),
+    "psnr_fg": ("foreground PSNR", 2),
     "psnr_boundary": ("boundary", 2),
     "semi_transparent": ("semi_transparent", 3),
 }
@@ -184,7 +184,7 @@ def refinement_means(rows: list[Any]) -> dict[str, Any]:
 
 def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people: int) -> str:
     """The table of the page."""
-    header = ["photos", "start", "seconds", "task", *(heading for heading, _ in SHOWN.values()), "least gain"]
+    header = ["photos", "start", "seconds", "task", *(heading for heading, _ in SHOWN.values()), "worst-subject gain"]
     rows = []
     for name, lengths in numbers.items():
         size, count, start = name.split(" ", 2)
@@ -193,7 +193,10 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
                 scores = [f"{cell[task][key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
                 least = f"{cell['least_gain']:.2f}" if task == "novel" and seconds != "0" else ""
                 rows.append([f"{count} of {size} px", start, seconds, TASKS[task], *scores, least])
-    about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; least gain: of any person."
+    about = (
+        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; "
+        "worst-subject gain: the least of any person."
+    )
     scored_at = settings.get("scored_at")
     about += f" Views of {scored_at} px." if scored_at else ""
     true = {
@@ -207,7 +210,7 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
 
 
 def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
-    """PSNR of the whole image and on the person against seconds."""
+    """PSNR of the whole image and of the foreground against seconds."""
     with figure(path, 2, (9, 3.6), legend=0.2) as axes:
         for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole image", SHOWN["psnr_fg"][0]), strict=True):
             for i, (name, lengths) in enumerate(numbers.items()):
@@ -241,8 +244,8 @@ def compare(run: Run, results: tuple[str, ...]) -> None:
     named = dict(pair.split("=", 1) for pair in results)
     found = {name: json.loads(Path(path).read_text()) for name, path in named.items()}
     numbers = compared(found)
-    heads = {"psnr": "PSNR", "psnr_fg": "on the person", "ssim": "SSIM"}
-    tasks = {"novel": "same pose", "animation": "unseen poses"}
+    heads = {"psnr": "PSNR", "psnr_fg": "foreground PSNR", "ssim": "SSIM"}
+    tasks = {"novel": "same pose", "animation": "novel poses"}
     header = [
         "weights",
         "refined, s",
@@ -332,7 +335,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         "512 px, refined for 1 s": by_size["512"]["1"]["novel"],
         "512 px, refined for 1 s, in poses that no photo shows": by_size["512"]["1"]["animation"],
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
-        "baseline: the painted body mesh, 256 px": {
+        "vertex-color baseline, 256 px": {
             name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "ssim", "psnr_fg")
         },
     }

@@ -179,7 +179,7 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
             continue
         shown = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_fg']:.1f}"]
         rows.append([name, "warned" if row["warnings"] else "avatar", *shown, (row["warnings"] or [""])[0]])
-    header = ["case", "result", "reach", "PSNR", "on the person", "first line"]
+    header = ["case", "result", "reach", "PSNR", "foreground PSNR", "first line"]
     run.show(markdown_table(header, rows, "llrrrl"), numbers)
 
 

@@ -2,7 +2,7 @@
 
 Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the generator's jitter, number 0 the
 most frontal one. N photos are every (RING / N)-th camera, so each person is rendered once for all numbers of photos. Held-out
-cameras and unseen poses are those of `humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
+cameras and novel poses are those of `humangs_jax.people.writer.write_person` for the same seed; images have 8 bits as on disk.
 
 A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos, and in poses that no photo
 shows; means over views, under the protocol "humangs".
@@ -42,7 +42,7 @@ from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capt
 
 RING = 12
 """Cameras that photos are taken from; numbers of photos divide it."""
-TASKS = {"novel": "new views, same pose", "animation": "new views, unseen poses"}
+TASKS = {"novel": "novel views", "animation": "novel poses"}
 Scores = dict[str, float | None]
 
 
@@ -51,8 +51,8 @@ class People:
     """Options:
     subjects: how many people
     held_out: views to compare with, in the pose of the photos
-    poses: unseen poses
-    pose_views: views to compare with, of each unseen pose
+    poses: novel poses
+    pose_views: views to compare with, of each novel pose
     size: side of the photos in pixels
     first: index of the first person within the split
     split: seeds of the people; choices are made on "validation"
@@ -137,7 +137,7 @@ class Start(NamedTuple):
         s = self.settings
         return (
             f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
-            f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in unseen poses; "
+            f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in novel poses; "
             f"weights {s['weights'][:12]}, tokens: {s['tokens']}."
         )
 
@@ -264,7 +264,7 @@ def _as_stored(capture):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Drawn:
-    """The held-out views of a person as drawn: ours (v, h, w, 3) and the painted body (v, h, w, 3), in [0, 1]."""
+    """The held-out views of a person as drawn: ours (v, h, w, 3) and the vertex-color baseline (v, h, w, 3), in [0, 1]."""
 
     ours: np.ndarray
     painted: np.ndarray
@@ -299,7 +299,7 @@ def score_tasks(
 
 
 def score_person(drawn: Drawn, held_out: Capture, lpips: Lpips | None = None) -> dict[str, Scores]:
-    """Scores by task, those of the painted body beside ours under names with the prefix "baseline_"."""
+    """Scores by task, those of the vertex-color baseline beside ours under names with the prefix "baseline_"."""
     ours, painted = (score_tasks(x, held_out, lpips) for x in (drawn.ours, drawn.painted))
     compared = ("psnr", "ssim", "psnr_fg", "lpips")
     return {task: ours[task] | {f"baseline_{name}": painted[task][name] for name in compared} for task in ours}

@@ -1,7 +1,7 @@
 """Speed against accuracy of the whole path: what each knob costs in decibels and takes in time, memory and bytes.
 
 Quality is the mean over people of the split "tradeoff", whom nothing else has seen: new views in the pose of the photos and in
-unseen poses. Photos and true images have 512 pixels; frames of another size are brought to 512 before they are compared. Times
+novel poses. Photos and true images have 512 pixels; frames of another size are brought to 512 before they are compared. Times
 are CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
 programs stretch wall times by far more. Refinement is counted in steps. Compilation does not count. Memory: what making the
 avatar or refining it adds.
@@ -54,7 +54,7 @@ from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine_with_report
 
 SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
-"""Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
+"""Held-out views of a person: of the pose of the photos; novel poses; views of each."""
 PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 FRAMES = 10
@@ -130,7 +130,7 @@ def presets(run: Run, people: Path | None = None) -> int:
     for point in (point for point in points() if point.knob == "preset"):
         row: dict[str, Any] = {"people": []}
         bench.measure(point, 0, row)
-        said, names = claimed["points"][point.name], ("PSNR, same pose", "PSNR, unseen poses")
+        said, names = claimed["points"][point.name], ("PSNR, same pose", "PSNR, novel poses")
         pairs = [(key, row[key], said[key], abs(row[key] / said[key] - 1) <= CLOSE) for key in ("reconstruct", "frame")]
         found = [row["people"][0][task]["psnr"] for task in TASKS]
         pairs += [(n, a, b, abs(a - b) <= DECIBELS) for n, a, b in zip(names, found, said["first_person"], strict=True)]
@@ -190,7 +190,7 @@ class Bench:
             return
         avatar = self.made(point, i)
         scores = self.scores(point, avatar, self.person(i))
-        if i == 0 and point.start == "painted body":
+        if i == 0 and point.start == "vertex-color baseline":
             row |= self.painted_times()
         elif i == 0:
             with tempfile.TemporaryDirectory() as folder:
@@ -208,7 +208,7 @@ class Bench:
         key = (settings, point.start, i)
         if key not in self.kept:
             photos = self.person(i).inputs(settings.views or 4)
-            if point.start == "painted body":
+            if point.start == "vertex-color baseline":
                 avatar = painted_body(photos)
             else:
                 avatar = reconstruct_with(settings.unrefined, self.variables, self.config, photos)
@@ -224,7 +224,7 @@ class Bench:
     def scores(self, point, avatar, person):
         """Scores by task, of frames brought to the size of the truth."""
         truth = person.held_out
-        if point.start == "painted body":
+        if point.start == "vertex-color baseline":
             return score_tasks(draw_painted_body(avatar, truth), truth)
         avatar = self.pruned(point, avatar, truth)
         poses, cameras = capture_views(avatar, truth)
@@ -305,7 +305,7 @@ class Bench:
         return (jax.block_until_ready(rendering) for rendering in renderings)
 
     def painted_times(self) -> dict[str, Any]:
-        """Of the painted body: the mesh with its colors, rasterized."""
+        """Of the vertex-color baseline: the mesh with its colors, rasterized."""
         photos, held_out = self.person(0).inputs(4), self.person(0).held_out
         one = held_out.select([0])
         colors = painted_body(photos)

@@ -1,4 +1,4 @@
-"""Baselines of the bench (the painted body mesh, a system fitted to one person), and checks against the release's arrays."""
+"""Baselines of the bench (the vertex-color baseline, a system fitted to one person), and checks against the release's arrays."""
 
 import json
 import tempfile
@@ -36,7 +36,7 @@ COUNTS = (1, PHOTOS)
 
 @entry
 def paper_painted(run: Run, validation: Path, people: Path) -> None:
-    """The painted body mesh on the people of the bench: what a system must beat before it counts as trained.
+    """The vertex-color baseline on the people of the bench: what a system must beat before it counts as trained.
 
     The vertices have the mean colors of the photos that see them, grey where none does. Folders that are missing are made.
 

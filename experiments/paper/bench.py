@@ -52,10 +52,10 @@ NOISE = "noise"
 
 SHIPPED = "HumanGS, shipped"
 """Name of the weights that come with the package."""
-PAINTED, PAINTED_TABLE = "painted body mesh", "paper_painted"
+PAINTED, PAINTED_TABLE = "vertex-color baseline", "paper_painted"
 """The baseline without a network, and its table (`painted.py`)."""
 MARGIN = 3.0
-"""dB of foreground PSNR over the painted body mesh. With less all systems of the bench showed grey bodies, with more clothes."""
+"""dB of foreground PSNR over the vertex-color baseline. With less all systems showed grey bodies, with more clothes."""
 NOT_TRAINED = "not trained"
 PAPER = "paper"
 """Marks a row of the printed paper in every table."""
@@ -256,7 +256,7 @@ def verdict(difference: float, interval: float | None) -> str:
 
 
 def untrained(rows: Mapping[str, Any], painted: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the runs that have learned too little for a comparison: `MARGIN` over the painted body mesh is not reached.
+    """Names of the runs that have learned too little for a comparison: `MARGIN` over the vertex-color baseline is not reached.
 
     painted: its scores by number of photos, of the same people and views. That of `PHOTOS` counts for all.
     """

@@ -153,7 +153,7 @@ def of_systems(n: Numbers) -> list[Claim]:
         Claim(
             "animated by skinning alone, better than HumanRAM",
             f"{pair(ANIMATION[OURS], ANIMATION[HUMANRAM])}; Animatable Gaussians {ANIMATION['Animatable Gaussians'][0]}",
-            f"unseen poses, against `humanram`: {n.said(moved)}",
+            f"novel poses, against `humanram`: {n.said(moved)}",
             *n.judge(moved, needs=["humanram"]),
         ),
         Claim(

@@ -57,7 +57,7 @@ def paper_figures(
 ) -> None:
     """The paper's figures, of trained variants.
 
-    varying: PSNR of unseen poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; token: PSNR
+    varying: PSNR of novel poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; token: PSNR
     with and without the global token over photos; features: histogram of what the features of four depths change in a patch of
     64 x 64 pixels of 512 more than half of which is the person (LPIPS where --lpips is given, squared error otherwise); driven:
     people in the poses of other people; systems: the first person by every system of the bench that is trained.
@@ -207,7 +207,7 @@ def driven(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, 
         row = [case.inputs.images[0]]
         for step in range(1, SHOWN + 1):
             poses = others.load((index + step) % len(others.names)).truth.poses
-            pose = jax.tree.map(lambda x: x[-1:], poses)  # the last one: an unseen pose where there is one
+            pose = jax.tree.map(lambda x: x[-1:], poses)  # the last one: an novel pose where there is one
             standing = replace(pose, translation=own.translation)  # where the person stood, before the same camera
             cameras = jax.tree.map(lambda x: x[None], camera)
             row.append(np.clip(np.asarray(next(iter(draw(avatar, standing, cameras, jnp.ones(3)))).rgb), 0, 1))

@@ -77,7 +77,7 @@ class Compared(Tested):
 def paper_tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ()) -> None:
     """The paper's tables with our rows beside the printed ones.
 
-    animation: table 1, unseen poses and views; reconstruction: table 2, views in the pose of the photos, and in others; domains:
+    animation: table 1, novel poses and views; reconstruction: table 2, views in the pose of the photos, and in others; domains:
     table 3, people like those of training, and of other kinds; systems that were trained on another division of the people;
     views: 1, 2, 4 and 6 photos, cameras at the distance of training and nearer; gaussians: 1 against 1 + 4 and 1 + 8 Gaussians a
     vertex.

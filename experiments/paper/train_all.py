@@ -158,7 +158,7 @@ def table(
 ) -> str:
     """A row a variant, with its difference to what it is compared with; below, what another seed changes.
 
-    painted: scores of the painted body mesh by number of photos; runs that hardly beat it are marked as not trained.
+    painted: scores of the vertex-color baseline by number of photos; runs that hardly beat it are marked as not trained.
     """
     lines, interval = [], seed_interval(rows)
     gray = untrained(rows, painted) if painted else ()

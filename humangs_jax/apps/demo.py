@@ -72,7 +72,7 @@ def summary(report: dict[str, Any]) -> str:
     """What `run_demo` found, in one line."""
     quality = (
         f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR {report['psnr_fg']:.2f} dB on "
-        f"{report['views']['held_out']} views that the network has not seen (painted body mesh: {report['baseline_psnr']:.2f} dB)"
+        f"{report['views']['held_out']} held-out views (vertex-color baseline: {report['baseline_psnr']:.2f} dB)"
     )
     refined = report.get("refined")
     if refined is None:

@@ -183,7 +183,7 @@ MAKES, FRAMES, STEPS = 3, 16, 6
 class FrontPoint:
     """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
     without refinement, of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
-    in the pose of the photos and in unseen poses.
+    in the pose of the photos and in novel poses.
     """
 
     name: str
@@ -423,7 +423,9 @@ def in_words(tuned: Tuned, best: FrontPoint) -> str:
     takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
     takes += "" if cost.memory_mb is None else f", {cost.memory_mb:.0f} MiB"
     lost = best.psnr - point.psnr, best.psnr_poses - point.psnr_poses
-    gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in unseen poses against {best.name!r}"
+    gives = (
+        f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against {best.name!r}"
+    )
     gives = "is the best of all settings" if point.name == best.name else gives
     return f"{point.name}: {', '.join(parts)}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 

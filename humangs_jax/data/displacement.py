@@ -17,11 +17,11 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.body.resolution import vertex_areas
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of, signed_distance
 from humangs_jax.data.usable_views import MASK_THRESHOLD, joint_moves, joint_turns, unusable_views
+from humangs_jax.geometry.mesh import face_crosses, unit, vertex_areas
 from humangs_jax.io.images import resized
 
 INSET = (0.005, 0.025)
@@ -243,7 +243,5 @@ def _at(image, pixels):
 
 
 def _normals(vertices, faces):
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    summed = np.stack([np.bincount(faces.ravel(), across[:, i], len(vertices)) for i in range(3)], axis=-1)
-    return summed / np.maximum(np.linalg.norm(summed, axis=-1, keepdims=True), 1e-12)
+    across = np.repeat(face_crosses(vertices, faces), 3, axis=0)
+    return unit(np.stack([np.bincount(faces.ravel(), across[:, i], len(vertices)) for i in range(3)], axis=-1))

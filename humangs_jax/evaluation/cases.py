@@ -388,7 +388,7 @@ def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
-    """The painted body mesh on white, in the poses and from the cameras of a capture."""
+    """The vertex-color baseline on white, in the poses and from the cameras of a capture."""
     body = views.body
     rest = shape_body(body, jnp.asarray(views.betas))
 

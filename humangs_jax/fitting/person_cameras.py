@@ -13,7 +13,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.model import shape_body
 from humangs_jax.core.array_types import Bool, Float
@@ -28,8 +27,9 @@ from humangs_jax.fitting.person_bundle import (
     pixel_errors,
     place_person,
 )
-from humangs_jax.fitting.residuals.keypoints import NOISE, OUTER
+from humangs_jax.fitting.residuals.keypoints import NOISE, OPTICAL_AXIS, OUTER
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL, USUAL_STD, EXIF_STD = 29.0, 0.2, 0.03
@@ -240,7 +240,7 @@ def _evidence(seen, mirror, mirrored) -> tuple[Evidence, Rig]:
     hips = [name in ("left_hip", "right_hip") for name in seen.names]
     seen_hips = np.where((weights * hips).all(1, where=np.asarray(hips), keepdims=True), weights * hips, weights)
     rays = np.asarray([_ray(*own) for own in zip(points, seen_hips, focal, strict=True)])
-    world = np.einsum("cab,ckb->cka", np.stack([_turn_to(ray) for ray in rays]), world)
+    world = np.einsum("cab,ckb->cka", smallest_turns(OPTICAL_AXIS, rays), world)
     world = np.asarray([_centered(*own) for own in zip(world, weights, strict=True)])
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
@@ -256,12 +256,6 @@ def _ray(points, weights, focal):
     """The unit direction in which a camera sees the person."""
     direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
     return direction / np.linalg.norm(direction)
-
-
-def _turn_to(ray):
-    """The shortest rotation (3, 3) from the optical axis to a unit direction."""
-    axis = np.cross([0.0, 0.0, 1.0], ray)
-    return Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * np.arccos(np.clip(ray[2], -1, 1))).as_matrix()
 
 
 def _person_size(points, weights):

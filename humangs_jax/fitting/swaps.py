@@ -164,7 +164,8 @@ def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: O
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
     pick = lambda values: jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
-    world = None if observations.world is None else pick(observations.world)
+    # where left and right are exchanged the detector may have seen the body turned round: its depths say nothing then
+    world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
     return replace(
         observations, points=pick(observations.points), confidences=pick(observations.confidences), world=world
     )

@@ -70,8 +70,8 @@ class Runtime:
     """Side of the photos in pixels, a multiple of the patch size; None: as the weights were trained."""
     crop: bool = knob(
         False,
-        cost="0.15 dB on the person for one of four people",
-        gain="pixels of the person in place of background: 0.3 dB on the person on average",
+        cost="0.15 dB in the foreground for one of four people",
+        gain="pixels of the person in place of background: 0.3 dB in the foreground on average",
         measured=EVALUATION,
     )
     """Photos are cut to the square around the person's mask before they are brought to that size."""

@@ -169,7 +169,7 @@ def test_what_is_given_up_is_said():
     )
     text = in_words(tuning.Tuned(low, Cost(210.0, 0.0, 12.5, 300.0), {}), best)
     assert "2 photos" in text and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
-    assert "gives up 6.5 dB in the pose of the photos and 6.5 dB in unseen poses against 'best'" in text
+    assert "gives up 6.5 dB in the pose of the photos and 6.5 dB in novel poses against 'best'" in text
     assert "is the best of all settings" in in_words(tuning.Tuned(best, Cost(1.0, 0.0, 1.0), {}), best)
 
 

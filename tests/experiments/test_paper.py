@@ -184,6 +184,6 @@ def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are(tmp_path, mon
     monkeypatch.setattr(figures, "load_capture", lambda folder: frames)
     chosen = figures.varied(tmp_path, 4)["person"]
     assert frames.frames[chosen["context"]].tolist() == [0, 1, 0, 1] and len(set(chosen["context"])) == 4
-    assert frames.frames[chosen["target"]].tolist() == [2] * 4  # an unseen pose
+    assert frames.frames[chosen["target"]].tolist() == [2] * 4  # an novel pose
     (tmp_path / "person" / "held_out").mkdir(parents=True)
     assert figures.varied(tmp_path, 4) is None

@@ -180,7 +180,7 @@ def test_it_is_told_where_more_photos_are_worse():
 
 def test_the_section_has_means_and_the_best_and_worst():
     section = quality.views_section(people(v1=[21, 22], v4=[25, 26]), 4, "about")
-    assert "| new views, unseen poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
+    assert "| novel poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
     assert "LPIPS" not in section and "| worst 1 | 1 | 25.00 |" in section
 
 

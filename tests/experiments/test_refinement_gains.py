@@ -25,8 +25,8 @@ def test_means_gains_and_the_table():
     cell = means["256 4 network"]["5"]
     assert cell["novel"]["psnr"] == 23.25 and cell["least_gain"] == 0.5
     table = refinement_section(means, {"split": "test"}, 2)
-    assert "| 4 of 256 px | network | 5 | new views, same pose | 23.25 | 18.75 | 15.00 | 0.100 | 0.50 |" in table
-    assert "| 4 of 256 px | network | 0 | new views, same pose | 22.00 | 18.75 | 15.00 | 0.100 |  |" in table
+    assert "| 4 of 256 px | network | 5 | novel views | 23.25 | 18.75 | 15.00 | 0.100 | 0.50 |" in table
+    assert "| 4 of 256 px | network | 0 | novel views | 22.00 | 18.75 | 15.00 | 0.100 |  |" in table
 
 
 def test_weights_side_by_side_are_of_the_same_people_and_of_one_start():
@@ -65,7 +65,7 @@ def test_readme_quality_is_of_the_same_people_and_weights():
     rows = readme_quality(demo, people, refined).splitlines()[2:]
     assert rows[0] == "| 3 synthetic people, 256 px, feed-forward | 27.4 | 0.946 | 18.8 |" and len(rows) == 6
     assert rows[4] == "| the demo's person, 256 px, refined for 15 s | 29.2 | 0.946 | 18.8 |"
-    assert rows[5] == "| baseline: the painted body mesh, 256 px | 20.7 | 0.800 | 11.3 |"
+    assert rows[5] == "| vertex-color baseline, 256 px | 20.7 | 0.800 | 11.3 |"
     for said, changed in {
         "expected `humangs demo` without": (DEMO, people, refined),
         "2 people were refined: expected the same 3": (demo, people, refined | {"people": 2}),

@@ -27,7 +27,7 @@ def test_the_front_has_what_nothing_else_beats():
         row("refined", 9, 1, 25, steps=100),
         row("beaten", 1.2, 1.1, 21),
         row("slower to draw, better", 1, 2, 24),
-        row("naive", 0.1, 0.1, 30, start="painted body"),
+        row("naive", 0.1, 0.1, 30, start="vertex-color baseline"),
         row("large", 0.1, 0.1, 30) | {"size": 1024},
     ]
     assert [r["name"] for r in report.front_of(rows)] == ["fast", "slow", "slower to draw, better", "refined"]

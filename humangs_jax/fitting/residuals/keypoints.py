@@ -27,6 +27,7 @@ NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
 """Metres: how far from where they are thought to be detectors see landmarks."""
+OPTICAL_AXIS = np.asarray([0.0, 0.0, 1.0])
 WORLD_STD = 0.15
 """Of a detector's 3D landmarks, over the root mean square of their distances from their middle."""
 RAYLEIGH_MEDIAN = 1.1774
@@ -73,22 +74,24 @@ def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Obse
     cameras = photos.cameras
     world = None
     if keypoints.world is not None and views.shape[1] == 1:  # several views say more than any of them alone
-        world = _in_camera_axes(keypoints.world[views], points, confidences, np.asarray(cameras.K)[views])
+        hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
+        own = np.where((confidences * hips).any(-1, keepdims=True), confidences * hips, confidences)
+        world = _in_camera_axes(keypoints.world[views], points, own, np.asarray(cameras.K)[views])
     return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views], world), views
 
 
 def _in_camera_axes(
     world: Float[np.ndarray, "m c k 3"],
     points: Float[np.ndarray, "m c k 2"],
-    confidences: Float[np.ndarray, "m c k"],
+    weights: Float[np.ndarray, "m c k"],
     K: Float[np.ndarray, "m c 3 3"],
 ) -> Float[np.ndarray, "m c k 3"]:
-    """Landmarks whose z axis is the ray to the person, in the axes of the camera."""
-    middle = (confidences[..., None] * points).sum(-2) / np.maximum(confidences.sum(-1), 1e-9)[..., None]
+    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the camera."""
+    total = weights.sum(-1, keepdims=True)
+    middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
     focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
-    seen = confidences.sum(-1, keepdims=True) > 0
-    rays = np.concatenate([np.where(seen, (middle - center) / focal, 0), np.ones((*seen.shape[:-1], 1))], axis=-1)
-    turns = smallest_turns(np.asarray([0.0, 0.0, 1.0]), rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    rays = np.concatenate([np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1)
+    turns = smallest_turns(OPTICAL_AXIS, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
     return np.einsum("mcab,mckb->mcka", turns, world)
 
 
