@@ -19,9 +19,11 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def commands() -> str:
-    """The help texts of all commands as one Markdown text."""
-    names = re.findall(r"\{([a-z,]+)\}", help_of())[0].split(",")
-    return "\n\n".join(f"## humangs {name}\n\n```text\n{help_of(name)}\n```" for name in names)
+    """The overview and the help texts of all commands as one Markdown text."""
+    from humangs_jax.cli import COMMANDS
+
+    texts = [f"```text\n{help_of()}\n```"]
+    return "\n\n".join(texts + [f"## humangs {name}\n\n```text\n{help_of(name)}\n```" for name in COMMANDS])
 
 
 def help_of(*command: str) -> str:

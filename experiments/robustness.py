@@ -226,7 +226,7 @@ def limits(run: Run, people: int = 2) -> None:
     """How far a quantity may be off, alone, until the mean PSNR of some people has fallen by 1 dB; writes assets/limits.json.
 
     People of the validation seeds, four photos of 256 pixels; linear between the values tried. With --publish,
-    humangs_jax/assets/limits.json is written for `humangs check --limits`.
+    humangs_jax/assets/limits.json is written for `humangs check --ranges`.
 
     Options:
     people: how many

@@ -2,12 +2,14 @@ import dataclasses
 import functools
 import logging
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
@@ -25,8 +27,8 @@ COMMANDS = tuple(cli.COMMANDS)
 def test_every_page_that_a_help_text_names_exists():
     docs = Path(__file__).parents[1]
     sources = [file.read_text() for file in Path(cli.__file__).parent.glob("*.py")]
-    pages = {page for text in sources for page in re.findall(r"docs/\w+\.md", text)}
-    assert len(pages) > 4 and all((docs / page).is_file() for page in pages), pages
+    pages = {page for text in sources for page in re.findall(r"\bdocs: (\w+)", text)}
+    assert len(pages) > 4 and all((docs / f"docs/{page}.md").is_file() for page in pages), pages
 
 
 def test_help_names_every_command_and_imports_nothing_heavy():
@@ -41,11 +43,17 @@ def test_help_names_every_command_and_imports_nothing_heavy():
 def test_every_command_explains_itself(command, humangs):
     code, out, _ = humangs(command, "--help")
     assert code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
+    assert "None" not in out and "docs/" not in out
+    lines = out.split("examples:\n")[1].splitlines()
+    assert len(lines) == len(set(lines)) == 2
+    for line in lines:
+        assert line.startswith(f"  humangs {command} ")
+        cli._parsed(shlex.split(line)[1:])
 
 
 @pytest.mark.parametrize(
     ("words", "usage"),
-    [("import cameras", "import cameras [-h] [OPTIONS] PATH"), ("import", "import [-h] [OPTIONS] {cameras}")],
+    [("import cameras", "import cameras [-h] [OPTIONS] SOURCE"), ("import", "import [-h] [OPTIONS] WHAT")],
 )
 def test_the_usage_of_an_import_can_be_typed_as_it_stands(words, usage, humangs):
     _, out, _ = humangs(*words.split(), "--help")
@@ -161,12 +169,14 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
 def test_version_and_unknown_commands(humangs):
     assert humangs("--version") == (0, f"humangs_jax {__version__}\n", "")
     assert humangs("check", "--version")[0] == 0
-    assert humangs("chekc")[0] == cli.BAD_USAGE
+    assert humangs("chekc") == (cli.BAD_USAGE, "", "humangs: error: 'chekc' is no command: did you mean 'check'?\n")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
     """A command of two stages."""
+
+    examples: ClassVar = ()
 
     fails: str = ""
 

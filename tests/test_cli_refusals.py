@@ -121,7 +121,7 @@ BAD_DATA = {
     "fit photo.png --keypoints k.json": "photo.png",
     f"{FIT} --out new": "k.json",
     "fit --scan scan.obj --out new": "scan.obj",
-    "fit --scan scan.obj --views v": "scan.obj",
+    "fit --scan scan.obj --scan-views v": "scan.obj",
     "import cameras none --images someone/images --out new": "none",
 }
 SIZES = {"animate me.npz": "", "render me.npz": "", "demo": " 16 to 8,192", "synth": " 128, 256 or 512"}
@@ -138,7 +138,7 @@ BAD_USAGE = {
     "animate me.npz --azimuth nan": "--azimuth nan: expected -36,000 to 36,000",
     "preprocess thuman in --out x --body b.npz --views 0": "--views 0",
     "animate nobody.npz --out a.txt": "--out a.txt: expected a name ending in",
-    "demo --refine inf": "--refine inf: expected at least 0",
+    "demo --refine inf": "--refine 'inf': expected how long",
     "synth --workers 0": "--workers 0: expected at least 1",
     "synth --subjects 0 --out people": "--subjects 0: expected at least 1",
     "synth --for-training --views 7": "--views 7: does not go with --for-training, which means 12",
@@ -161,7 +161,7 @@ BAD_USAGE = {
             *("fit --scan s.obj", "start photos", "render me.npz"),
         )
     },
-    "fit --scan s.obj --views file": "--views file: is a file",
+    "fit --scan s.obj --scan-views file": "--scan-views file: is a file",
     "fit": "give either a CAPTURE folder or --scan MESH",
     "fit someone --scan scan.obj": "give either a CAPTURE folder or --scan MESH",
     "fit someone": "body.npz exists: --overwrite replaces it",
@@ -171,8 +171,8 @@ BAD_USAGE = {
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
     "fit --scan scan.obj --refine": "--refine is for captures, not for --scan",
     "fit --scan scan.obj": "--out FOLDER is missing",
-    "fit --scan scan.obj --keypoints k.json --out new": "needs --views FOLDER",
-    "fit --scan scan.obj --joints j.json --views v": "--joints and --views: give one",
+    "fit --scan scan.obj --keypoints k.json --out new": "needs --scan-views FOLDER",
+    "fit --scan scan.obj --joints j.json --scan-views v": "--joints and --scan-views: give one",
 }
 REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]
 REFUSED += [(line, cli.BAD_USAGE, said) for line, said in BAD_USAGE.items()]

@@ -23,6 +23,7 @@ from experiments.harness import listed, parser_of
 from humangs_jax import cli
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
+from humangs_jax.cli.options import UsageError
 from humangs_jax.data.capture import load_capture, save_capture
 
 ROOT = Path(__file__).parents[1]
@@ -214,6 +215,8 @@ def parsed(*words):
             cli._parsed(words)
     except SystemExit as exit_:
         return None if exit_.code in (0, None) else printed.getvalue()
+    except UsageError as error:
+        return str(error)
     return None
 
 

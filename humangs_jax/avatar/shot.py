@@ -35,11 +35,9 @@ class Shot:
     fov: Annotated[float, Range(1, 150)] = 30.0
     """Vertical field of view, degrees."""
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"
-    """How Gaussians are drawn: near_exact and fast trade accuracy for time (docs/performance.md), inria is the published
-    rasterizer. Default: as the avatar's weights were trained."""
+    """How Gaussians are rendered: near_exact and fast trade accuracy for time, inria is the published rasterizer."""
     prune: bool = False
-    """Leave out Gaussians that weigh less than 1/255 on every pixel of every image. To find them all images are drawn once more:
-    docs/video.md has what it saves."""
+    """Leave out Gaussians that no image shows; to find them, all images are drawn once more (docs: video)."""
 
     def check(self) -> None:
         """Raises: ValueError naming what is out of range."""  # not on construction: the command line would make a box of it

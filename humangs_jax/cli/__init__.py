@@ -7,11 +7,12 @@ Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad
 to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors are one line on stderr, with nothing half-written.
 """
 
+import difflib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from humangs_jax import __version__
 
@@ -21,38 +22,49 @@ BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 
 @runtime_checkable
 class Command(Protocol):
-    """A subcommand with its options."""
+    """A subcommand with its options. The first line of its docstring is its line in `humangs --help`."""
+
+    examples: ClassVar[tuple[str, ...]]
+    """Lines that --help ends with."""
 
     def run(self) -> None:
         """Do the work. Raises: ValueError or OSError for wrong input."""
         ...
 
 
-COMMANDS = {
-    "start": "start.Start",
-    "detect": "captures.Detect",
-    "import": "captures.ImportCameras",
-    "fit": "fit.Fit",
-    "check": "fit.Check",
-    "demo": "avatars.Demo",
-    "reconstruct": "avatars.Reconstruct",
-    "refine": "avatars.Refine",
-    "tune": "avatars.Tune",
-    "animate": "animate.Animate",
-    "render": "animate.Render",
-    "export": "avatars.Export",
-    "evaluate": "evaluate.Evaluate",
-    "view": "animate.View",
-    "synth": "captures.Synth",
-    "preprocess": "training.Preprocess",
-    "train": "training.Train",
-    "convert": "training.Convert",
+GROUPS = {
+    "Make an avatar": {
+        "start": "start.Start",
+        "reconstruct": "avatars.Reconstruct",
+        "refine": "avatars.Refine",
+        "tune": "avatars.Tune",
+        "demo": "avatars.Demo",
+    },
+    "Look at it": {"animate": "animate.Animate", "render": "animate.Render", "view": "animate.View"},
+    "Take it along": {"export": "avatars.Export"},
+    "Prepare photos": {
+        "detect": "captures.Detect",
+        "import": "captures.ImportCameras",
+        "fit": "fit.Fit",
+        "check": "fit.Check",
+    },
+    "Research": {
+        "evaluate": "evaluate.Evaluate",
+        "synth": "captures.Synth",
+        "preprocess": "training.Preprocess",
+        "train": "training.Train",
+        "convert": "training.Convert",
+    },
 }
-"""Module and class of each command, imported when it is asked for."""
-DESCRIPTION = (
-    "Animatable 3D Gaussian humans from a few photos with body poses. For every command: --quiet shows results and errors "
-    "only, --verbose also what libraries log, --version the version."
-)
+"""Commands by purpose: module and class of each, imported when it is asked for."""
+COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
+ABOUT = "Animatable 3D Gaussian humans from a few photos with body poses."
+EVERYWHERE = """Options of every command:
+  --help       its options, with examples
+  --quiet      results and errors only
+  --verbose    also what libraries log
+  --version    the version
+Completion for bash, zsh or tcsh: humangs --tyro-print-completion SHELL"""
 
 
 def main() -> None:
@@ -123,18 +135,45 @@ def _prepare(verbose: bool) -> None:
 
 
 def _parsed(arguments: list[str]) -> Command:
-    """The command with its options. Only its own module is imported, and only its options are looked at: that is faster."""
+    """The command with its options. Only its own module is imported, and only its options are looked at: that is faster.
+
+    Raises: SystemExit after --help, or for options that tyro refuses; UsageError for an unknown command.
+    """
+    if not arguments or arguments[0] in ("--help", "-h"):
+        print(overview())
+        raise SystemExit(0 if arguments else BAD_USAGE)
     import tyro
 
-    if arguments and arguments[0] in COMMANDS:
-        words = 2 if arguments[:2] == ["import", "cameras"] else 1  # tyro's usage has no word that is given already
-        prog = " ".join(["humangs", *arguments[:words]])
-        return tyro.cli(_command(arguments[0]), prog=prog, args=arguments[1:])
-    every = {name: _command(name) for name in COMMANDS}
-    return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", description=DESCRIPTION, args=arguments)
+    from humangs_jax.cli.options import UsageError, described
+
+    name, *options = arguments
+    if name == "--tyro-print-completion" or name == "--tyro-write-completion":
+        every = {each: described(_command(each)) for each in COMMANDS}
+        return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", args=arguments)  # ty: ignore[no-matching-overload]
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else "`humangs --help` lists them"
+        raise UsageError(f"{name!r} is no command: {hint}")
+    command = described(_command(name))
+    prog = " ".join(["humangs", *arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1]])
+    try:
+        return tyro.cli(command, prog=prog, args=options, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as end:
+        if not end.code:
+            print("examples:", *(f"  {example}" for example in command.examples), sep="\n")
+        raise
 
 
-def _command(name: str) -> Callable[..., Any]:
+def overview() -> str:
+    """What `humangs --help` prints: all commands by purpose, a line for each."""
+    lines = ["usage: humangs COMMAND [OPTIONS]", "", ABOUT]
+    for group, commands in GROUPS.items():
+        lines += ["", f"{group}:"]
+        lines += [f"  {name:<12} {(_command(name).__doc__ or '').splitlines()[0]}" for name in commands]
+    return "\n".join([*lines, "", EVERYWHERE])
+
+
+def _command(name: str) -> type[Any]:
     module, _, kind = COMMANDS[name].partition(".")
     return getattr(importlib.import_module(f"humangs_jax.cli.{module}"), kind)
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -30,8 +30,15 @@ FROM_THE_SIDE = Shot(azimuth=20.0)
 
 @dataclasses.dataclass(frozen=True)
 class Animate:
-    """Animate an avatar with a motion and write a video, or a folder of PNG files. The camera goes along with the person."""
+    """Animate an avatar with a motion: a video, or a folder of PNG files.
 
+    The camera goes along with the person. Files of motions: docs: motions.
+    """
+
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs animate avatar.npz --motion dance.bvh --out dance.mp4",
+        "humangs animate avatar.npz --turn 360 --background transparent --out walk.webm",
+    )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
@@ -40,17 +47,17 @@ class Animate:
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
     follow: bool = True
-    """The camera goes along with the person; --no-follow: it stands still, and sees everywhere that the person goes."""
+    """The camera stands still and sees everywhere that the person goes."""
     fps: Annotated[float | None, RATE] = None
     """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
     start: float = 0.0
-    """Where to begin, in seconds of the motion."""
+    """Begin at this second of the motion."""
     stop: float | None = None
-    """Where to end, in seconds of the motion."""
+    """End at this second of the motion. Default: its end."""
     loop: int = 1
-    """How often to play the motion; each repetition starts where the one before has ended."""
+    """How often to play the motion; each repetition starts where the last one ended."""
     preset: Preset | None = None
-    """Speed against accuracy: how it is drawn, where --splat does not say (docs/tradeoff.md)."""
+    """Speed against accuracy of splatting, without --splat (docs: tradeoff)."""
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
 
@@ -82,8 +89,15 @@ class Animate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, as images or as a video, or in the poses and from the cameras of a capture."""
+    """Render an avatar from a circle of cameras, or from the cameras of a capture.
 
+    As images, as layers of an EXR file, or as a video of one turn (docs: video).
+    """
+
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs render avatar.npz --views 12 --out views",
+        "humangs render avatar.npz --capture me --exr --out views",
+    )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot]
@@ -93,19 +107,19 @@ class Render:
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
     views: Annotated[int | None, at_least(1)] = None
-    """Number of cameras on the circle. Default: 8; for a video as many as one turn in 4 seconds takes."""
+    """How many cameras on the circle. Default: 8; for a video, those of a turn of 4 seconds."""
     fps: Annotated[float, RATE] = 24.0
     """Frames per second of a video."""
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead of a circle."""
     exr: bool = False
-    """Also write views.exr, one part per view: premultiplied colors, further channels, and the camera (docs/video.md)."""
+    """Also write views.exr, one part per view: premultiplied colors, --channels, and the camera."""
     channels: str = "rgba,z"
-    """Of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
+    """Channels of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
     exr_type: Literal["float", "half"] = "float"
-    """Numbers of views.exr. half: Z and positions still have 32 bits."""
+    """Number type of views.exr. half: depths and positions still have 32 bits."""
     preset: Preset | None = None
-    """Speed against accuracy: how it is drawn, where --splat does not say (docs/tradeoff.md)."""
+    """Speed against accuracy of splatting, without --splat (docs: tradeoff)."""
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
 
@@ -163,23 +177,27 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Show an avatar moving in the browser: serves the page of `humangs export --html` on this machine until Ctrl-C. With --live,
-    show what a training run or a refinement makes while it runs.
+    """Show an avatar moving in the browser, or what a running training or refinement makes.
+
+    Serves the HTML viewer on this machine until Ctrl-C (docs: viewer).
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs view avatar.npz --motion dance.bvh",
+        "humangs view runs/train --live",
+    )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`. --live: an avatar file that is shown anew whenever it is replaced (`humangs refine
-    --live` does so), or the folder of a training run, whose newest weights reconstruct someone."""
+    """File written by `humangs reconstruct`. With --live: of `humangs refine --live`, or the folder of a training run."""
     motion: Path | None = None
     """The motion it plays. Default: the shipped walk."""
     port: Annotated[int, Range(0, 65535)] = 0
     """Port on 127.0.0.1; 0 for any free one."""
     browser: bool = True
-    """Open the browser; --no-browser only prints the address."""
+    """Print the address, and open no browser."""
     live: bool = False
     """Follow a training run or an avatar file that is being refined."""
     capture: Path | None = None
-    """--live of a training run: the capture of the person that it reconstructs. Default: the shipped one."""
+    """Whom a training run reconstructs with --live. Default: the shipped capture."""
 
     def run(self) -> None:
         if self.capture is not None and not self.live:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import Positional, arg
 
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from humangs_jax.data.motion import Motion
 
 
-DEMO_SECONDS = 15.0
-"""Of refinement."""
+DEMO_REFINE = "15s"
 
 _USUAL_UP = (
     f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers expect, else y."
@@ -39,27 +38,31 @@ _USUAL_UP = (
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Reconstruct the person that comes with the package from four photos, render new views, animate the avatar."""
+    """Try everything on the shipped person: reconstruct, refine, render new views, animate."""
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs demo --out demo_out",
+        "humangs demo --refine 0 --preset realtime",
+    )
     out: Annotated[Path, Place()] = Path("demo_out")
     """Folder for the images, the video, the avatar and report.json."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     size: Side = 256
     """Side of the animation's frames in pixels."""
-    refine: Annotated[float | None, at_least(0)] = None
-    """Seconds for which the avatar is fitted to its photos; 0 for none. Default: 15, or as long as --preset says."""
+    refine: str | None = None
+    """How long to fit the avatar to its photos: 15s, 100steps, or 0. Default: 15s, or as --preset says."""
     preset: Preset | None = None
-    """Speed against accuracy (docs/tradeoff.md): photos, network, drawing, and refinement where --refine does not say."""
+    """Speed against accuracy (docs: tradeoff): photos, network, splatting, and refinement without --refine."""
 
     def run(self) -> None:
+        limits = first_refinement(DEMO_REFINE if self.refine is None else self.refine)
         with stage("starting"):
             from humangs_jax.apps.demo import run_demo, summary
             from humangs_jax.refinement.config import RefineConfig
 
         settings = chosen_settings(self.preset, None)
-        seconds = DEMO_SECONDS if self.refine is None else self.refine
-        refine = RefineConfig(seconds=seconds) if seconds else None
+        refine = None if limits is None else RefineConfig(**limits)
         if settings is not None and self.refine is None:
             refine = settings.refinement
         report = run_demo(self.out, self.weights, self.size, refine, settings)
@@ -69,33 +72,37 @@ class Demo:
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct an avatar from a capture folder (photos, cameras, body poses: docs/capture_format.md)."""
+    """Reconstruct an avatar from a capture folder: photos, cameras, body poses.
 
+    The format of captures: docs: capture_format.
+    """
+
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs reconstruct me --out avatar.npz",
+        "humangs reconstruct me --refine 15s --out sharp.npz",
+    )
     capture: Positional[Path]
-    """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
+    """Folder with capture.json; "demo_capture" is the shipped one."""
     out: Annotated[Path, AVATAR] = Path("avatar.npz")
-    """The avatar file to write; an avatar that is there is replaced."""
+    """The avatar file to write or replace."""
     views: Annotated[int | Literal["auto"] | None, at_least(1)] = None
-    """Use this number of photos: those that together show most of the body; auto: those that add something. Default: all."""
+    """How many photos to use: those that together show most of the body; auto: those that add something. Default: all."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
-    """The patches of the photos that the network reads: all, or those that show the person, which is several times
-    faster. For weights trained with the other setting it is an approximation (docs/performance.md)."""
+    """The patches that the network reads: all, or several times faster those that show the person (docs: performance)."""
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
-    """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
+    """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not
-    at all. Default, if there are masks: iterations of a learned update alone, one to two seconds, on photos of at most 512
-    pixels."""
+    """How long to fit the avatar to the photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
     preset: Preset | None = None
-    """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
+    """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the options above."""
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
     fit_masks: bool = True
-    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
+    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
     check: bool = True
-    """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
+    """Skip the quick check of whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
         limits = first_refinement(self.refine)
@@ -136,31 +143,35 @@ class Reconstruct:
 
 @dataclasses.dataclass(frozen=True)
 class Refine:
-    """Fit an avatar to the photos of a capture: iterations of a learned update, then gradient descent.
+    """Fit an avatar to the photos of a capture: learned-optimizer iterations, then gradient descent.
 
     Ctrl-C ends it early; the best avatar until then is written.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs refine avatar.npz me --limit 15s --out sharp.npz",
+        "humangs refine avatar.npz me --limit 60s --live",
+    )
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
     capture: Positional[Path]
     """Folder with capture.json: may have more or larger photos than the network saw."""
     out: Annotated[Path, AVATAR] = Path("refined.npz")
-    """The avatar file to write; an avatar that is there is replaced."""
+    """The avatar file to write or replace."""
     limit: str = "15s"
-    """How long: seconds ("15s"), steps ("100steps") or iterations alone ("0steps"), after a compilation of some seconds."""
+    """How long after compiling: 15s, 100steps, or 0steps for the iterations alone."""
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
-    """Iterations of the learned update before the steps; 0: steps alone."""
+    """Learned-optimizer iterations before the steps."""
     image_size: Side | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
-    """Also refine the pose of each photo. On bodies that are millimetres off it gained nothing (docs/refinement.md)."""
+    """Also refine the pose of each photo; it gains where bodies are more than millimetres off (docs: refinement)."""
     live: bool = False
-    """Write the avatar so far to --out now and then, which `humangs view --live OUT` shows."""
+    """Write the avatar so far to --out now and then, for `humangs view --live`."""
     fit_masks: bool = True
-    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
+    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
     check: bool = True
-    """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
+    """Skip the quick check of whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")
@@ -227,31 +238,33 @@ def _save(avatar: "Avatar", out: Path, how: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Export an avatar (docs/export.md): a page that shows it moving in any browser (--html), or a file for other programs.
+    """Export an avatar: Gaussians or a textured mesh for other programs, or an HTML viewer.
 
-    Gaussians, or the body as a textured mesh: in the T-pose, in one frame of a motion, or in many.
+    In the T-pose, in one frame of a motion, or in many. Programs and formats: docs: export.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs export avatar.npz --html avatar.html",
+        "humangs export avatar.npz --out person.glb --mesh --motion dance.bvh",
+    )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     out: Annotated[
         Path | None, arg(help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it.")
     ] = None
     html: Annotated[Path | None, Place((".html",))] = None
-    """The page to write: one .html file that needs no network (docs/viewer.md)."""
+    """The HTML viewer to write: one file that needs no network (docs: viewer)."""
     mesh: bool = False
-    """--out: the body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
+    """The body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
     motion: Path | None = None
-    """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose). docs/motions.md."""
+    """The motion that the viewer plays (default: the shipped walk) or that poses --out (default: T-pose). docs: motions."""
     frame: int | None = None
-    """--out: which frame of the motion, from 0 (default: the first)."""
+    """Which frame of the motion, from 0. Default: the first."""
     frames: str | None = None
-    """--out: many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
-    up: Annotated[
-        Up | None, arg(help=f"--out: the axis that points up in the file; feet are on 0. Default: {_USUAL_UP}")
-    ] = None
+    """Many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
+    up: Annotated[Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")] = None
     rest: bool = False
-    """3DGS: add the 45 zero f_rest fields that some importers (Unity) require."""
+    """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
@@ -334,16 +347,20 @@ class Export:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """Find the best settings within a budget, measured on this machine with this person, for `humangs reconstruct --config`.
+    """Find the best settings within a budget of time or memory, measured on this machine.
 
-    Tries a few settings of docs/tradeoff.md, the fastest first. Times are without compilation, which happens once. The exit code
-    is 1, and nothing is written, if no setting is within the budget.
+    The result is for --config of `reconstruct`, `animate`, `render`. Times are without compilation. The exit code is 1, and
+    nothing is written, if no setting is within the budget. The settings that are tried: docs: tradeoff.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs tune me --frame-ms 33 --out realtime.json",
+        "humangs tune me --reconstruct-ms 2000 --memory-mb 500",
+    )
     capture: Positional[Path]
-    """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
+    """Folder with capture.json; "demo_capture" is the shipped one."""
     out: Annotated[Path, Place((".json",))] = Path("tuned.json")
-    """The settings to write, for --config of `reconstruct`, `animate`, `render`; beside them an image, of the same name."""
+    """The settings to write; beside them an image of the same name."""
     reconstruct_ms: float | None = None
     """The most that making the avatar may take, with refinement, milliseconds."""
     frame_ms: float | None = None

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -45,18 +45,21 @@ def found_here(capture: Path, person: int | None) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Detect:
-    """Find the person in photos: 33 keypoints and a mask for each, and a sheet on which everybody has a number.
+    """Find the person in photos: 33 keypoints and a mask for each photo.
 
-    Needs `pip install 'humangs_jax[photos]'`. In a capture folder, whose cameras are known, people are matched by how well they
-    triangulate; in other photos by their size, or by their colors where several are large. docs/your_photos.md shows the way.
+    people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs: your_photos.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs detect photos --out found",
+        "humangs detect photos --person 1 --out found",
+    )
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
     out: Annotated[Path, Place()]
     """Folder for keypoints.json, masks/, people.png (the sheet) and people.json (everybody)."""
     person: Annotated[int | None, at_least(0)] = None
-    """Which person, by the number on the sheet, where several are of nearly one size."""
+    """Which person, by the number on people.png. Default: the one who is largest."""
 
     def run(self) -> None:
         with stage("starting"):
@@ -80,11 +83,15 @@ SIZES = (128, 256, 512)
 
 @dataclasses.dataclass(frozen=True)
 class ImportCameras:
-    """Make a capture folder from photos and the calibration of their cameras; then `humangs fit` finds the body.
+    """Make a capture folder from photos and the calibration of their cameras.
 
-    Conventions of every format: docs/cameras.md.
+    Then `humangs fit` finds the body. Conventions of every format: docs: cameras.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs import cameras calibration.json --images photos --masks masks --out me",
+        "humangs import cameras sparse/0 --images photos --scale 0.01 --up=-y --out me",
+    )
     what: Positional[Literal["cameras"]]
     """"cameras"."""
     source: Annotated[Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")]
@@ -102,7 +109,7 @@ class ImportCameras:
     """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half). Default: the format's."""
     every: int = 1
     """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
-    frames: int | None = None
+    max_frames: int | None = None
     """Take at most that many frames of the videos."""
     overwrite: bool = False
     """Replace the capture folder."""
@@ -113,11 +120,11 @@ class ImportCameras:
         with stage("starting"):
             from humangs_jax.data.calibration.importing import import_cameras
 
-        options = {name: value for name, value in vars(self).items() if name != "what"}
+        options = {name: value for name, value in vars(self).items() if name not in ("what", "max_frames")}
         if self.overwrite and (self.out / "capture.json").is_file():
             tell_deleted(self.out)
         with stage("importing"):
-            report = import_cameras(**options)
+            report = import_cameras(**options, frames=self.max_frames)
         tell(report)
         suggest("humangs fit", self.out, "--keypoints FILE")
 
@@ -138,8 +145,15 @@ class Extras:
 
 @dataclasses.dataclass(frozen=True)
 class Synth:
-    """Make synthetic clothed people and write them as capture folders. Can be interrupted and resumed, or added to."""
+    """Make synthetic clothed people and write them as capture folders.
 
+    Can be interrupted and resumed, or added to. docs: synthetic_people.
+    """
+
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs synth --subjects 100 --for-training --out people",
+        "humangs synth --subjects 8 --split test --held-out 6 --out test_people",
+    )
     extras: OmitArgPrefixes[Extras]
     out: Annotated[Path, Place()] = Path("synthetic_people")
     """Folder for one capture folder per subject and manifest.json."""
@@ -159,7 +173,7 @@ class Synth:
     """Poses per subject."""
     sequences: bool = False
     """The poses are frames of a walk, a turn or a reach, which is written as motion.npz."""
-    frames: Annotated[int, at_least(1)] = 60
+    motion_frames: Annotated[int, at_least(1)] = 60
     """Length of that motion, 30 frames per second."""
     for_training: bool = False
     """Short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`."""
@@ -170,8 +184,8 @@ class Synth:
         extras = self.extras
         if self.size not in SIZES:
             raise UsageError(f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}")
-        if self.sequences and self.poses > self.frames:
-            raise UsageError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
+        if self.sequences and self.poses > self.motion_frames:
+            raise UsageError(f"--poses {self.poses}: expected at most --motion-frames {self.motion_frames}")
         small = FOR_TRAINING if self.for_training else {}
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, value in small.items():
@@ -189,7 +203,7 @@ class Synth:
             small.get("views", self.views),
             small.get("close_views", self.close_views),
             extras.held_out,
-            frames=self.frames if self.sequences else 0,
+            frames=self.motion_frames if self.sequences else 0,
             scan_texture=2048 if extras.scans else 0,
         )
         with stage("making people"):

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -14,7 +14,7 @@ from humangs_jax.core.configuration import at_least
 
 @dataclasses.dataclass(frozen=True)
 class LpipsFiles:
-    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs/loss_networks.md)."""
+    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs: loss_networks)."""
 
     lpips_vgg: tuple[Path, ...] = ()
     """LPIPS of vgg. Default: of the extra `lpips`, if it is installed."""
@@ -26,15 +26,19 @@ class LpipsFiles:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Score new views of people against photos (docs/evaluation.md).
+    """Score novel views of people against photos: PSNR, SSIM, LPIPS.
 
-    With --weights (or nothing: the shipped ones) people are reconstructed from input photos and compared on the other views;
-    --avatar compares avatars; --predictions compares images that any program has rendered, by their file names.
+    Of weights (people are reconstructed from some photos and compared on the others), of avatars, or of images that any program
+    rendered. Protocols of papers: docs: evaluation.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs evaluate people --weights weights.safetensors --html scores.html",
+        "humangs evaluate me --avatar avatar.npz --json scores.json",
+    )
     lpips: OmitArgPrefixes[LpipsFiles]
     source: Positional[Path]
-    """A capture folder, a folder of them, a scene list, or a data set (docs/datasets.md)."""
+    """A capture folder, a folder of them, a scene list, or a data set (docs: datasets)."""
     avatar: Path | None = None
     """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
     weights: Path | None = None

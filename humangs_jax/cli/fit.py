@@ -6,7 +6,7 @@ Everything is checked before the work begins, and written after it.
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -21,9 +21,7 @@ from humangs_jax.data.formats import KEYPOINTS
 class Detections:
     """2D keypoints of a detector."""
 
-    keypoints: Annotated[Path | None, arg(help=f"Keypoint file or folder (docs/fitting.md): {KEYPOINTS.listed()}.")] = (
-        None
-    )
+    keypoints: Annotated[Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")] = None
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
@@ -44,14 +42,13 @@ class Scan:
     scan: Path | None = None
     """A mesh with a person in it, of any scale and orientation."""
     joints: Path | None = None
-    """3D landmarks of the scan by name (.json or .npz). Without these and --views, the pose is searched."""
-    views: Path | None = None
+    """3D landmarks of the scan by name (.json or .npz). Without these and --scan-views, the pose is searched."""
+    scan_views: Path | None = None
     """Folder of images of the scan. They are rendered there; then, with --keypoints, those that the keypoints are of."""
     height: float | None = None
     """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
     bare: bool = False
-    """The person wears no clothes or tight ones: the body is to fill the scan, or with --refine the masks. For measuring bodies;
-    avatars are better when it stays a little inside of the masks."""
+    """Fill the scan, or with --refine the masks: to measure a body in no or tight clothes. Avatars are better without."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +63,7 @@ class Refinement:
 
 Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
-    "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
+    "--scan": {"keypoints", "person", "body", "joints", "scan_views", "height", "bare"},
     "--refine": {"keypoints", "person", "fixed_cameras", "bare"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
@@ -75,13 +72,16 @@ WAYS: dict[Way, set[str]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Find the body of one's own photos: from keypoints of a detector, or inside of a scan; or refine what is there.
+    """Find the body in photos with cameras, or in a scan; or refine a body by masks.
 
-    humangs fit CAPTURE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints: of --keypoints FILE,
-    or found in the photos, as masks are where there are none.
-    humangs fit CAPTURE --refine: improve cameras and poses of a capture with its masks. humangs fit --scan MESH --out FOLDER.
+    With CAPTURE: shape and poses from 2D keypoints of --keypoints, or of the shipped detector. With CAPTURE --refine: better
+    cameras and poses from masks. With --scan: the body in a mesh. docs: fitting.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs fit me --keypoints keypoints.json",
+        "humangs fit --scan scan.obj --height 1.78 --out fitted",
+    )
     detections: OmitArgPrefixes[Detections]
     scan: OmitArgPrefixes[Scan]
     refinement: OmitArgPrefixes[Refinement]
@@ -90,8 +90,7 @@ class Fit:
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
     smoothness: Annotated[float, at_least(0)] = 0.0
-    """Typical acceleration of joints in metres per frame squared, for sequences (walking at 24 frames a second: 0.02). 0:
-    frames are fitted one by one."""
+    """For sequences: typical acceleration of joints, metres per frame squared; 0.02 for walking at 24 fps. 0: none."""
     out: Path | None = None
     """Folder for the result. Default: the capture folder itself."""
     overwrite: bool = False
@@ -127,10 +126,10 @@ class Fit:
         scan, keypoints = self.scan, self.detections.keypoints
         inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
         in_place = self.capture is not None and (self.out is None or self.out.resolve() == self.capture.resolve())
-        if scan.views is not None:
-            require_folder(scan.views, "--views")
+        if scan.scan_views is not None:
+            require_folder(scan.scan_views, "--scan-views")
         if self.out is not None and not in_place:
-            mark, views = ("scan_fit.json", scan.views) if way == "--scan" else ("capture.json", None)
+            mark, views = ("scan_fit.json", scan.scan_views) if way == "--scan" else ("capture.json", None)
             require_replaceable(self.out, self.overwrite, mark, (*inputs, views))
         elif self.capture is not None and self.capture.is_dir():
             require_folder(self.capture, "CAPTURE")
@@ -208,11 +207,11 @@ class Fit:
 
     def _fit_scan(self) -> None:
         scan, keypoints = self.scan, self.detections.keypoints
-        if scan.joints is not None and scan.views is not None:
-            raise UsageError("--joints and --views: give one of them, both say where the joints are")
-        if keypoints is not None and scan.views is None:
-            raise UsageError("--keypoints of a scan needs --views FOLDER, the images that they are of")
-        only_views = scan.views is not None and keypoints is None
+        if scan.joints is not None and scan.scan_views is not None:
+            raise UsageError("--joints and --scan-views: give one of them, both say where the joints are")
+        if keypoints is not None and scan.scan_views is None:
+            raise UsageError("--keypoints of a scan needs --scan-views FOLDER, the images that they are of")
+        only_views = scan.scan_views is not None and keypoints is None
         if self.out is None and not only_views:
             raise UsageError("--out FOLDER is missing: where the body of the scan goes")
         with stage("starting"):
@@ -225,19 +224,19 @@ class Fit:
 
         assert scan.scan is not None  # `run` has checked it
         if only_views:
-            assert scan.views is not None
+            assert scan.scan_views is not None
             with stage("rendering the scan"):
-                render_scan_views(scan.scan, scan.views)
-            wrote(scan.views, f"images of the scan; find keypoints in {scan.views / 'images'}, then")
-            suggest("humangs fit --scan", scan.scan, "--views", scan.views, "--keypoints FILE --out FOLDER")
+                render_scan_views(scan.scan, scan.scan_views)
+            wrote(scan.scan_views, f"images of the scan; find keypoints in {scan.scan_views / 'images'}, then")
+            suggest("humangs fit --scan", scan.scan, "--scan-views", scan.scan_views, "--keypoints FILE --out FOLDER")
             return
         assert self.out is not None
-        check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.views, keypoints, self.body))
+        check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.scan_views, keypoints, self.body))
         tell_deleted(self.out)
         with stage("reading joints and body"):
             joints = None if scan.joints is None else read_joints(scan.joints)
-            if scan.views is not None:
-                joints = joints_from_views(scan.views, self.detections.read(load_photos(scan.views)))
+            if scan.scan_views is not None:
+                joints = joints_from_views(scan.scan_views, self.detections.read(load_photos(scan.scan_views)))
             body = load_body(self.body)
         with stage("fitting"):
             fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
@@ -250,18 +249,22 @@ class Fit:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Draw the posed body over each photo of a capture: a wrong pose or camera convention is easy to see.
+    """Draw the body over each photo of a capture, and name what looks wrong.
 
-    For a capture that `humangs fit` made, also its keypoints, how far off the body is, and what the views do not determine.
+    For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs check me --out check.png",
+        "humangs check me --ranges",
+    )
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
     out: Annotated[Path, Place((".png",))] = Path("check.png")
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
-    limits: bool = False
-    """Also print the ranges in which avatars stay good, and where this capture lies in them (docs/stability.md)."""
+    ranges: bool = False
+    """Also print the ranges in which avatars stay good, and where this capture lies in them (docs: stability)."""
 
     def run(self) -> None:
         sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
@@ -285,7 +288,7 @@ class Check:
             same = record is not None and record.names == capture.names
             report = check_capture(capture, self.out, record.keypoints if same else keypoints)
         tell(report)
-        if self.limits:
+        if self.ranges:
             from humangs_jax.apps.check import limits_table
 
             tell(limits_table(capture))

@@ -6,13 +6,17 @@ folder of a capture or of a fit to a scan is replaced with --overwrite only; `de
 """
 
 import dataclasses
+import functools
 import os
 import re
 import tempfile
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from tyro.conf import Positional, arg
 
 from humangs_jax.core.configuration import Range, at_least, check_range, marks_in
 from humangs_jax.core.progress import say
@@ -53,6 +57,42 @@ class Place:
 
 
 AVATAR = Place((".npz",), avatar=True)
+_VALUES = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+
+
+@functools.cache
+def described(command: type[Any]) -> type[Any]:
+    """The dataclass of a command with what --help shows of its options: positional arguments by name, no default that is None.
+
+    tyro alone shows `PATH` for every positional argument, `{None}|PATH`, and `(default: None)`.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    for field in dataclasses.fields(command):
+        hint = hints[field.name]
+        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        if dataclasses.is_dataclass(kind):
+            described(kind)
+            continue
+        shown = _value_shown(kind)
+        if Positional in getattr(hint, "__metadata__", ()):
+            name = field.name.upper()
+            shown = name if field.default is dataclasses.MISSING else f"[{name}]"
+        quiet = field.default in (None, ()) or kind is bool
+        seen = arg(metavar=shown, help_behavior_hint="" if quiet else None)
+        command.__annotations__[field.name] = Annotated[hint, seen]  # ty: ignore[invalid-type-form]
+    return command
+
+
+def _value_shown(kind: Any) -> str | None:
+    """The metavar of a type; None for one that tyro names."""
+    if get_origin(kind) is Annotated:
+        return _value_shown(get_args(kind)[0])
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(map(str, get_args(kind))) + "}"
+    if get_origin(kind) in (Union, UnionType):
+        parts = [_value_shown(part) for part in get_args(kind) if part is not type(None)]
+        return None if None in parts else "|".join(part for part in parts if part)
+    return _VALUES.get(kind)
 
 
 def check_options(command: Any) -> None:

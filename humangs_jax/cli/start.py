@@ -3,7 +3,7 @@
 import dataclasses
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 
@@ -25,15 +25,18 @@ MARK = "start.json"
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """From a folder of photos to an avatar: looks what is there, names the tools that make what is missing, and does the rest.
+    """From photos or a video of a person to an avatar in the browser.
 
-    With cameras, masks and keypoints beside the photos it imports, fits, checks and reconstructs, and opens the page. Run it
-    again when something was added. docs/your_photos.md shows the way.
+    Cameras, masks and keypoints are used where they are there, and estimated where they are not. Run it again when something was
+    added. docs: your_photos.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs start photos --out me --height 1.78",
+        "humangs start photos --cameras calibration.json --out me",
+    )
     photos: Positional[Path]
-    """Folder of the photos, or with a folder `images` in it; cameras, masks and keypoints are looked for in there. Or
-    a video, or a folder with one: its best frames become the photos in OUT_photos, where the rest is looked for."""
+    """Folder of photos, perhaps with cameras, masks and keypoints in it. Or a video: its best frames become OUT_photos."""
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
     cameras: Annotated[Path | None, arg(help=f"Calibration, if it is elsewhere: {CAMERAS.listed()}.")] = None
@@ -43,21 +46,19 @@ class Start:
     person: Annotated[int | None, at_least(0)] = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
     height: float | None = None
-    """Of the person without shoes, metres, like --height 1.78: the scale where there is no calibration. Default: that of an
-    average person, often 6 to 11 % too small."""
+    """Height of the person without shoes, metres: the scale where there is no calibration. Default: an average person's."""
     scale: float | None = None
     """Metres per unit of the calibration. Default: 1."""
     up: str | None = None
     """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
     without_masks: bool = False
-    """Do without masks: the photos have nothing but white behind the person."""
+    """Use no masks: the photos have nothing but white behind the person."""
     fit_masks: bool = True
-    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
+    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
     refine: str | None = None
-    """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all.
-    Needs masks. Default, if there are masks: iterations of a learned update alone, one to two seconds."""
+    """How long to fit the avatar to the photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
     browser: bool = True
-    """Open the page at the end."""
+    """Do not open the page at the end."""
     overwrite: bool = False
     """Start again, also where --out already has a body or a finished avatar."""
 

@@ -3,7 +3,7 @@
 import dataclasses
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -41,11 +41,15 @@ class ScanViews:
 
 @dataclasses.dataclass(frozen=True)
 class Preprocess:
-    """Turn a data set into photos with cameras and bodies, by the published protocol. Can be interrupted and resumed.
+    """Turn a data set into photos with cameras and bodies, by the published protocol.
 
-    Layouts of data sets, licences, and lines for SLURM: docs/datasets.md.
+    Can be interrupted and resumed. Layouts, licences, and lines for SLURM: docs: datasets.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs preprocess thuman THuman2.0 --body SMPLX_NEUTRAL.npz --out thuman",
+        "humangs preprocess thuman THuman2.0 --body SMPLX_NEUTRAL.npz --shard 0/8 --out thuman",
+    )
     kind: Annotated[Positional[Kind], arg(help=RAW.listed())]
     source: Positional[Path]
     """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the folder of several."""
@@ -100,7 +104,7 @@ class Preprocess:
 
 @dataclasses.dataclass(frozen=True)
 class LossNetworkFiles:
-    """Networks under perceptual losses (docs/loss_networks.md)."""
+    """Networks under perceptual losses (docs: loss_networks)."""
 
     vgg19: Path | None = None
     """Weights of VGG-19 for the perceptual loss. Default: structural dissimilarity (SSIM) takes its place."""
@@ -114,7 +118,7 @@ class LossNetworkFiles:
 
 @dataclasses.dataclass(frozen=True)
 class Processes:
-    """Training in several processes (docs/scaling.md)."""
+    """Training in several processes (docs: scaling)."""
 
     distributed: bool = False
     """This is one of several processes. SLURM or a TPU pod says which one, or the following options do."""
@@ -135,12 +139,19 @@ class Processes:
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a network on capture folders (`humangs synth --for-training`), on all devices. Continues the run in --out."""
+    """Train a network on capture folders, on all devices.
 
+    Continues the run in --out. docs: training.
+    """
+
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs train people --out runs/mine",
+        "humangs train --on-the-fly 1000 --config tiny --steps 200 --out runs/tiny",
+    )
     networks: OmitArgPrefixes[LossNetworkFiles]
     processes: OmitArgPrefixes[Processes]
     data: Positional[Path | None] = None
-    """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs/datasets.md)."""
+    """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs: datasets)."""
     body: Path | None = None
     """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz. Default: the body that comes with the package."""
     out: Annotated[Path, Place()] = Path("runs/train")
@@ -152,15 +163,13 @@ class Train:
     validation: Path | None = None
     """Other people to evaluate on now and then: anything that DATA accepts."""
     steps: Annotated[int | None, at_least(1)] = None
-    """Length of the run. Default: that of the configuration. More than a finished run has: it goes on, with the learning rate of
-    the longer run."""
+    """Length of the run. Default: that of the configuration. A finished run goes on if it is longer."""
     init_weights: Path | None = None
     """Start from these weights, and their network, instead of random ones."""
     fsdp: Annotated[int | None, at_least(1)] = None
     """How many devices share one copy of parameters and moments. Default: all."""
     diagnose: bool = False
-    """Do not train, but repeat the first step of the run that failed (or the next one) and name the first stage whose
-    numbers are not finite."""
+    """Repeat the step of the run that failed, or the next one, and name the first stage whose numbers are not finite."""
 
     def run(self) -> None:
         if self.data is None and not self.on_the_fly:
@@ -215,11 +224,15 @@ class Train:
 
 @dataclasses.dataclass(frozen=True)
 class Convert:
-    """Convert a checkpoint of the published network (.pt, read without torch, or .safetensors) into our weights.
+    """Convert a checkpoint of the published network into our weights.
 
-    Sizes and parts of the network are read off the shapes; everything else is as in the preset `published`.
+    Without torch. Sizes and parts are read off the shapes; everything else is as in the preset `published`. docs: parity.
     """
 
+    examples: ClassVar[tuple[str, ...]] = (
+        "humangs convert checkpoint.pt --out weights.safetensors",
+        "humangs convert checkpoint.pt --losses losses.safetensors --dtype float16",
+    )
     checkpoint: Positional[Path]
     """.pt with a state dict under 'model', or that state dict as .safetensors."""
     out: Annotated[Path, TENSORS] = Path("weights.safetensors")

@@ -74,7 +74,7 @@ COMMANDS = (
     Command("fit elsewhere", f"fit {{inputs}}/capture {CAPTURE} --out fitted"),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
     Command("fit --scan", "fit --scan {inputs}/scan.obj --out body --overwrite"),
-    Command("fit --scan --views", "fit --scan {inputs}/scan.obj --views views", first=None, once=True),
+    Command("fit --scan --scan-views", "fit --scan {inputs}/scan.obj --scan-views views", first=None, once=True),
     Command("check", "check {inputs}/capture --out check.png"),
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
     Command("reconstruct", "reconstruct {inputs}/capture --out me.npz --no-check"),

@@ -160,7 +160,7 @@ def test_processes_write_the_same_files(tmp_path):
     ("arguments", "layout", "first"),
     [
         (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
-        (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--first", "7"),
+        (("--size", "128", "--poses", "4", "--sequences", "--motion-frames", "30", "--first", "7"),
          writer.Layout(128, 4, 60, 12, frames=30), 7),
         (("--views", "4", "--close-views", "0", "--held-out", "8", "--scans"),
          writer.Layout(512, 1, 4, 0, 8, scan_texture=2048), 0),
@@ -179,7 +179,7 @@ def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, m
 
 
 @pytest.mark.parametrize(
-    "arguments", [("--subjects", "0"), ("--held-out", "-1"), ("--sequences", "--poses", "9", "--frames", "8")]
+    "arguments", [("--subjects", "0"), ("--held-out", "-1"), ("--sequences", "--poses", "9", "--motion-frames", "8")]
 )
 def test_wrong_numbers_are_one_line(arguments, tmp_path, monkeypatch, capsys):
     from humangs_jax import cli
