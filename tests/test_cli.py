@@ -53,7 +53,7 @@ def test_every_command_explains_itself(command, humangs):
 
 @pytest.mark.parametrize(
     ("words", "usage"),
-    [("import cameras", "import cameras [-h] [OPTIONS] SOURCE"), ("import", "import [-h] [OPTIONS] WHAT")],
+    [("import cameras", "import cameras [-h] [OPTIONS] SOURCE"), ("import", "import [-h] [OPTIONS] {cameras}")],
 )
 def test_the_usage_of_an_import_can_be_typed_as_it_stands(words, usage, humangs):
     _, out, _ = humangs(*words.split(), "--help")

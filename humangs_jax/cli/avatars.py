@@ -1,6 +1,7 @@
 """`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of it."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -17,8 +18,10 @@ from humangs_jax.cli.options import (
     first_refinement,
     refine_limits,
     require_file,
+    require_place,
+    shard_of,
 )
-from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.cli.screen import bar, stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.core.registry import alternatives
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
@@ -72,19 +75,20 @@ class Demo:
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct an avatar from a capture folder: photos, cameras, body poses.
+    """Reconstruct avatars from capture folders: photos, cameras, body poses.
 
-    The format of captures: docs: capture_format.
+    Several captures, or a folder of them, become OUT/NAME.npz. Those that are there are kept, so that the same command goes on
+    after an interruption; a capture that fails does not stop the others. docs: capture_format.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
-        "humangs reconstruct me --out avatar.npz",
         "humangs reconstruct me --refine 15s --out sharp.npz",
+        "humangs reconstruct people --out avatars --shard 0/8",
     )
-    capture: Positional[Path]
-    """Folder with capture.json; "demo_capture" is the shipped one."""
-    out: Annotated[Path, AVATAR] = Path("avatar.npz")
-    """The avatar file to write or replace."""
+    captures: Positional[tuple[Path, ...]]
+    """Folders with capture.json, or with such folders in them; "demo_capture" is the shipped one."""
+    out: Path | None = None
+    """The avatar file to write or replace, default: avatar.npz; of several captures a folder, default: avatars."""
     views: Annotated[int | Literal["auto"] | None, at_least(1)] = None
     """How many photos to use: those that together show most of the body; auto: those that add something. Default: all."""
     weights: Path | None = None
@@ -94,11 +98,15 @@ class Reconstruct:
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
     refine: str | None = None
-    """How long to fit the avatar to the photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
+    """How long to fit an avatar to its photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
     preset: Preset | None = None
     """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the options above."""
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
+    batch: Annotated[int | None, at_least(1)] = None
+    """Captures that the network reads at once. Default: 1 on a CPU, else 8."""
+    shard: str = "0/1"
+    """I/N: the I-th of N parts of the captures, counted from 0, for job arrays."""
     fit_masks: bool = True
     """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
     check: bool = True
@@ -106,39 +114,74 @@ class Reconstruct:
 
     def run(self) -> None:
         limits = first_refinement(self.refine)
+        part, parts = shard_of(self.shard)
+        captures = _capture_folders(self.captures)
+        several = tuple(captures.values()) != self.captures[:1]
+        out = self.out or Path("avatars" if several else "avatar.npz")
+        if several and out.suffix == ".npz":
+            raise UsageError(f"--out {out}: expected a folder for the avatars of several captures")
+        require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
-            from humangs_jax.avatar.reconstruct import reconstruct
-            from humangs_jax.data.views import select_views
+            from humangs_jax.apps.many import reconstruct_many
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
             settings = chosen_settings(self.preset, self.config)
-        photos = _read_capture(self.capture, self.check, self.fit_masks)
-        if self.refine not in (None, "0") and photos.masks is None:
-            raise UsageError(f"--refine {self.refine}: needs masks, and {self.capture} has none")
-        views = settings.views if settings is not None and self.views is None else self.views
-        if views == "auto" or (views is not None and views < photos.view_count):
-            with stage("choosing photos"):
-                photos = photos.select(select_views(photos, None if views == "auto" else views))
-            tell(f"photos: {', '.join(photos.names)}")
+        how = None if limits is None else RefineConfig(**limits)
+        if self.refine is None and settings is not None:
+            how = settings.refinement
+        if several:
+            self._begin_set(out)
+            done = {name for name in captures if (out / f"{name}.npz").exists()}
+            if done:
+                tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
+            captures = {name: folder for name, folder in list(captures.items())[part::parts] if name not in done}
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         config = config if settings is None else settings.network(config)
         said = {"tokens": self.tokens, "dtype": self.dtype}
         config = config.with_runtime(**{name: value for name, value in said.items() if value != "as_trained"})
+        views = settings.views if settings is not None and self.views is None else self.views
+        load = {name: functools.partial(self._photos, folder, views) for name, folder in captures.items()}
+        failed = []
         with stage("reconstructing"):
-            avatar = reconstruct(variables, config, photos)
-            avatar.gaussians.means.block_until_ready()
-        how = None if limits is None else RefineConfig(**limits)
-        if self.refine is None and settings is not None:
-            how = settings.refinement
-        if self.refine is None and how is not None and photos.masks is None:
-            how = None
-            tell("no masks: the avatar is not refined")
-        if how is None:
-            _save(avatar, self.out, f"from {photos.view_count} photos")
-        else:
-            _refine_and_save(avatar, photos, self.out, how)
+            made = reconstruct_many(variables, config, load, self.batch)
+            for name, photos, avatar, error in bar(made, total=len(load), shown=several, desc="reconstruct"):
+                if error is not None:
+                    if not several:
+                        raise error
+                    failed.append(name)
+                    warn(f"{name}: {error}")
+                    continue
+                if how is not None and photos.masks is None:
+                    tell(f"{name}: no masks: the avatar is not refined")
+                file = out / f"{name}.npz" if several else out
+                _refine_and_save(avatar, photos, file, how if photos.masks is not None else None)
+        if not several:
+            suggest("humangs view", out)
+        if failed:
+            raise ValueError(f"{len(failed)} of {len(load)} captures failed: {', '.join(failed)}")
+
+    def _begin_set(self, out: Path) -> None:
+        """Avatars that were made in other ways are not mixed. Raises: CaptureError."""
+        from humangs_jax.data.sets import AVATARS, SETTINGS, begin_set
+
+        apart = ("captures", "out", "batch", "shard", "check")
+        said = {name: value for name, value in vars(self).items() if name not in apart}
+        begin_set(out, AVATARS, {SETTINGS: {name: str(value) for name, value in said.items()}})
+
+    def _photos(self, folder: Path, views: int | str | None) -> "Capture":
+        """The views of a capture that are used. Raises: ValueError; UsageError for --refine without masks."""
+        photos = _read_capture(folder, self.check, self.fit_masks)
+        if self.refine not in (None, "0") and photos.masks is None:
+            raise UsageError(f"--refine {self.refine}: needs masks, and {folder} has none")
+        if views == "auto" or (isinstance(views, int) and views < photos.view_count):
+            from humangs_jax.data.views import select_views
+
+            with stage("choosing photos"):
+                photos = photos.select(select_views(photos, None if views == "auto" else int(views)))
+            tell(f"photos: {', '.join(photos.names)}")
+        return photos
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,6 +228,20 @@ class Refine:
         photos = _read_capture(self.capture, self.check, self.fit_masks)
         how = RefineConfig(iterations=self.iterations, image_size=self.image_size, poses=self.refine_poses, **limits)
         _refine_and_save(avatar, photos, self.out, how, self.live)
+        suggest("humangs view", self.out)
+
+
+def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
+    """Capture folders by name, those inside of given folders too. Raises: UsageError for two of one name."""
+    folders = []
+    for path in given:
+        inside = [] if (path / "capture.json").is_file() else sorted(path.glob("*/capture.json"))
+        folders += [file.parent for file in inside if not file.parent.name.startswith(".")] or [path]
+    named = {folder.absolute().name: folder for folder in folders}
+    if len(named) < len(folders):
+        twice = next(folder for folder in folders if named[folder.absolute().name] != folder)
+        raise UsageError(f"{named[twice.absolute().name]} and {twice}: expected captures of different names")
+    return named
 
 
 def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
@@ -213,11 +270,16 @@ def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     return photos
 
 
-def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig", live: bool = False) -> None:
-    """Refine with a progress bar, write the result (now and then, if live), say what it took.
+def _refine_and_save(
+    avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig | None", live: bool = False
+) -> None:
+    """Refine with a progress bar if asked, write the result (now and then, if live), say what it took.
 
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
+    if how is None:
+        _save(avatar, out, f"from {photos.view_count} photos")
+        return
     with stage("refining"):
         from humangs_jax.refinement.refine import refine_with_report
 
@@ -233,7 +295,6 @@ def _save(avatar: "Avatar", out: Path, how: str) -> None:
     with stage("writing"):
         avatar.save(out)
     wrote(out, f"{len(avatar.gaussians.means):,} Gaussians {how}")
-    suggest("humangs view", out)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ def described(command: type[Any]) -> type[Any]:
             described(kind)
             continue
         shown = _value_shown(kind)
-        if Positional in getattr(hint, "__metadata__", ()):
+        if Positional in getattr(hint, "__metadata__", ()) and get_origin(kind) is not Literal:
             name = field.name.upper()
             shown = name if field.default is dataclasses.MISSING else f"[{name}]"
         quiet = field.default in (None, ()) or kind is bool
@@ -111,10 +111,11 @@ def check_options(command: Any) -> None:
             raise UsageError(str(error)) from None
     for name, place in places.items():
         if (path := getattr(command, name)) is not None:
-            _require_place(path, option_of(name), place, [each for each in read if isinstance(each, Path)])
+            require_place(path, option_of(name), place, [each for each in read if isinstance(each, Path)])
 
 
-def _require_place(path: Path, option: str, place: Place, read: Iterable[Path]) -> None:
+def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = ()) -> None:
+    """Results of that kind can be written to that path. read: what the command reads. Raises: UsageError."""
     if not place.suffixes or (place.folder and not path.suffix):
         require_folder(path, option)
         return
@@ -219,6 +220,14 @@ def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings |
 
         return load_settings(config)
     return None
+
+
+def shard_of(text: str) -> tuple[int, int]:
+    """(I, N) of "I/N": the I-th of N parts, counted from 0. Raises: UsageError."""
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if match is None or not int(match[1]) < int(match[2]):
+        raise UsageError(f"--shard {text}: expected I/N with I from 0 to N - 1, as in 0/8")
+    return int(match[1]), int(match[2])
 
 
 def cores(workers: int | None) -> int:

@@ -21,6 +21,7 @@ from typing import TextIO
 
 from humangs_jax.cli import INTERRUPTED
 from humangs_jax.core import progress
+from humangs_jax.core.progress import bar as bar
 from humangs_jax.core.progress import say
 from humangs_jax.core.progress import stage as stage
 

@@ -1,13 +1,12 @@
 """`humangs preprocess`, `train`, `convert`: data sets as training reads them, weights of one's own, and the authors'."""
 
 import dataclasses
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.options import Place, UsageError, Workers, cores
+from humangs_jax.cli.options import Place, UsageError, Workers, cores, shard_of
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import DATASETS
@@ -71,9 +70,7 @@ class Preprocess:
 
     def run(self) -> None:
         scans = self.scans
-        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
-        if match is None or not int(match[1]) < int(match[2]):
-            raise UsageError(f"--shard {self.shard}: expected I/N with I from 0 to N - 1, as in 0/8")
+        part = shard_of(self.shard)
         from humangs_jax.data.preprocess.protocol import NEAR_FACTORS
 
         factors = NEAR_FACTORS if scans.near else scans.factors
@@ -95,7 +92,6 @@ class Preprocess:
             train=scans.train,
             test=scans.test,
         )
-        part = int(match[1]), int(match[2])
         with stage("preprocessing"):
             report = preprocess(self.source, self.out, self.body, settings, part, cores(self.workers))
         wrote(self.out, str(report))

@@ -25,6 +25,7 @@ class SetFormat(NamedTuple):
 
 
 SYNTHETIC, DATA_SET = SetFormat("humangs-synthetic", 2), SetFormat("humangs-dataset", 1)
+AVATARS = SetFormat("humangs-avatars", 1)
 
 
 def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:

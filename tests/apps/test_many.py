@@ -1,0 +1,126 @@
+import dataclasses
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from command_line import save_tiny_avatar
+
+from humangs_jax import cli
+from humangs_jax.apps import many
+from humangs_jax.apps.many import reconstruct_many
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.network import presets
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.weights import save_weights
+
+
+@pytest.fixture
+def avatar(tmp_path):
+    save_tiny_avatar(tmp_path / "tiny.npz")
+    return Avatar.load(tmp_path / "tiny.npz")
+
+
+def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(monkeypatch, avatar):
+    """13 cannot be read, 7 cannot be reconstructed, nor can a batch with it. Captures are numbered by their first frame."""
+    calls, demo = [], load_capture("demo_capture")
+
+    def batch(variables, config, captures):
+        calls.append(tuple(number(each) for each in captures))
+        if 7 in calls[-1]:
+            raise ValueError("captures[0]")
+        return [avatar for _ in captures]
+
+    def alone(variables, config, capture):
+        calls.append(number(capture))
+        if calls[-1] == 7:
+            raise ValueError("seven")
+        return avatar
+
+    def number(capture):
+        return int(capture.names[0])
+
+    def load(number):
+        if number == 13:
+            raise OSError("thirteen")
+        return dataclasses.replace(demo, names=(str(number), *demo.names[1:]))
+
+    monkeypatch.setattr(many, "reconstruct_batch", batch)
+    monkeypatch.setattr(many, "reconstruct", alone)
+    captures = {str(number): (lambda number=number: load(number)) for number in (1, 13, 2, 3, 7, 4, 5)}
+    found = list(reconstruct_many({}, presets.tiny(), captures, batch=3))
+    assert [each.name for each in found] == list(captures)
+    errors = {each.name: str(each.error) for each in found if each.avatar is None}
+    assert errors == {"13": "thirteen", "7": "seven"}
+    assert calls == [(1, 2), (3, 7, 4), 3, 7, 4, 5]
+
+
+@pytest.fixture
+def people(capture_folder, tmp_path, monkeypatch, avatar):
+    """Four captures, one of them spoiled, and a network that always makes the same avatar: the names it was asked for."""
+    for name in ("a", "b", "c", "d"):
+        shutil.copytree(capture_folder, tmp_path / "people" / name)
+    (tmp_path / "people/b/body.npz").write_bytes(b"spoiled")
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def stand_in(variables, config, captures, batch=None):
+        for name, load in captures.items():
+            asked.append(name)
+            done = many._loaded(name, load)
+            yield done if done.error else done._replace(avatar=avatar)
+
+    monkeypatch.setattr(many, "reconstruct_many", stand_in)
+    return asked
+
+
+def test_a_folder_of_captures_goes_on_after_failures_and_interruptions(people, tmp_path, humangs):
+    line = ("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars")
+    code, _, err = humangs(*line)
+    assert code == cli.BAD_DATA and "warning: b: " in err
+    assert err.splitlines()[-1] == "humangs: error: 1 of 4 captures failed: b"
+    assert {file.name for file in (tmp_path / "avatars").glob("*.npz")} == {"a.npz", "c.npz", "d.npz"}
+    shutil.copy("people/a/body.npz", "people/b/body.npz")
+    (tmp_path / "avatars/d.npz").unlink()
+    people.clear()
+    assert humangs(*line)[0] == 0 and people == ["b", "d"]
+    code, _, err = humangs(*line, "--views", "2")
+    assert code == cli.BAD_DATA and "views 'None' -> '2'" in err
+
+
+def test_shards_are_all_captures_once(people, humangs):
+    for shard in ("0/3", "1/3", "2/3"):
+        humangs("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars", "--shard", shard)
+    assert people == ["a", "d", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("reconstruct people --out x.npz", "--out x.npz: expected a folder"),
+        ("reconstruct people/a people/b/../a", "people/b/../a and people/a: expected captures of different names"),
+        ("reconstruct people --shard 3/3", "--shard 3/3: expected I/N"),
+        ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
+    ],
+)
+def test_what_cannot_be_meant_is_said_before_the_work(line, said, people, humangs):
+    code, out, err = humangs(*line.split())
+    assert (code, out) == (cli.BAD_USAGE, "") and said in err and not people
+
+
+@pytest.mark.slow
+def test_batches_are_the_avatars_of_single_captures(tmp_path, monkeypatch, humangs):
+    monkeypatch.chdir(tmp_path)
+    config = presets.tiny().with_conventions(body_vertices=500)
+    save_weights(tmp_path / "tiny.safetensors", init_humangs(jax.random.key(0), config), config)
+    demo = load_capture("demo_capture")
+    small = dataclasses.replace(demo.resized(64), names=demo.names)
+    for number, name in enumerate(("a", "b", "c"), start=2):
+        save_capture(tmp_path / "people" / name, small.select(np.arange(number)))
+    words = ("--weights", "tiny.safetensors", "--refine", "0", "--no-check")
+    assert humangs("reconstruct", "people", "--batch", "2", *words)[0] == 0
+    for name in ("a", "b", "c"):
+        assert humangs("reconstruct", f"people/{name}", *words, "--out", f"{name}.npz")[0] == 0
+        alone, batched = Avatar.load(f"{name}.npz"), Avatar.load(f"avatars/{name}.npz")
+        np.testing.assert_allclose(batched.gaussians.means, alone.gaussians.means, atol=1e-5)  # batched products round
