@@ -4,15 +4,20 @@ Swept tubes, sheets, boxes and silhouettes that follow one joint or the nearest 
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import hair, surfaces, tailoring
-from humangs_jax.people.anatomy import FLOOR, HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE, Anatomy
-from humangs_jax.people.fabrics import Material, band, color, mix
+from humangs_jax.people.anatomy import FLOOR, HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE, Anatomy, Vector
+from humangs_jax.people.fabrics import Fabric, Material, Spots, band, color, mix
 from humangs_jax.people.outfits import Garment
 from humangs_jax.people.surfaces import (
     Boundaries,
+    Faces,
+    Field,
+    Points,
     Surface,
     blurred,
     circle,
@@ -53,19 +58,19 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
     return [(surface, Material(fabric.colors, wrinkles=0.3))]
 
 
-def _painted(dye, sheen):
+def _painted(dye: Vector, sheen: float) -> Material:
     """A material of one color."""
     return Material(lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen)
 
 
-def _panelled(fabric, s):
+def _panelled(fabric: Fabric, s: Spots) -> Points:
     """Six panels of a cap with a button on top."""
     angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
     seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
     return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
 
 
-def _ribboned(fabric, s):
+def _ribboned(fabric: Fabric, s: Spots) -> Points:
     """A hat with a ribbon above its brim."""
     above = hair.above_line(s.template, hair.CAP_LINE)
     on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
@@ -77,7 +82,9 @@ def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
     return _ring(anatomy, np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02, -0.005)
 
 
-def _ring(anatomy, near, middle):
+def _ring(
+    anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float
+) -> tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]:
     """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed line."""
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
@@ -89,7 +96,14 @@ def _ring(anatomy, near, middle):
     return ring, unit(outwards)
 
 
-def _followed(anatomy, path, across, widths, columns, closed=True):
+def _followed(
+    anatomy: Anatomy,
+    path: Float[np.ndarray, "m 3"],
+    across: Float[np.ndarray, "*_m 3"],
+    widths: Float[np.ndarray, "m 2"] | float,
+    columns: int,
+    closed: bool = True,
+) -> Surface:
     """A swept tube that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
     (x, y, _), (vertices, faces) = anatomy.skin.template.T, sweep(path, across, widths, columns, closed)
     candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
@@ -112,7 +126,7 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
     return _followed(anatomy, path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
 
 
-def _face_opening(middle, half_width, half_height):
+def _face_opening(middle: float, half_width: float, half_height: float) -> Callable[[Field, Field], Field]:
     """Azimuths and heights -> positive outside of an oval around the face."""
     return lambda sides, height: ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
 
@@ -134,7 +148,9 @@ def scarf(rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: f
     return join(parts)
 
 
-def _tail(rng, anatomy, start, side, length, thickness, ease):
+def _tail(
+    rng: np.random.Generator, anatomy: Anatomy, start: Vector, side: int, length: float, thickness: float, ease: float
+) -> Surface:
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
@@ -148,7 +164,7 @@ def _tail(rng, anatomy, start, side, length, thickness, ease):
     return _followed(anatomy, path, SIDEWAYS, widths, 10, closed=False)
 
 
-def _on_head(anatomy, vertices, faces, template):
+def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points) -> Surface:
     return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
 
 
@@ -254,7 +270,7 @@ def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> 
     return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
 
 
-def _shoe(anatomy, side, height, sole, ease):
+def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) -> Surface:
     x, y, _ = anatomy.skin.template.T
     own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]

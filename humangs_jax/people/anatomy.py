@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.surfaces import Boundaries, Faces, Points, Surface, blurred, boundaries, vertex_normals
+from humangs_jax.people.surfaces import Boundaries, Faces, Field, Points, Surface, blurred, boundaries, vertex_normals
 
 Rotations = Float[np.ndarray, "j 3"]
 """Rotation vectors of all joints, relative to their parents."""
@@ -126,7 +126,7 @@ class Foot:
     lift: float = 0.0
 
 
-Feet = tuple[Foot, Foot]
+Feet = tuple[Foot, ...]
 """The left and the right one."""
 LEGS = ((LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT), (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT))
 
@@ -168,7 +168,7 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
         target, orientation = ankle_of(build, side, foot)
         start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
         thigh, shin = build.joints[knee] - build.joints[hip], build.joints[ankle] - build.joints[knee]
-        bend = _knee_angle(thigh, shin, np.linalg.norm(target - start))
+        bend = _knee_angle(thigh, shin, float(np.linalg.norm(target - start)))
         across = turn[:, 0] + orientation[:, 0]  # knees point between where the pelvis and where the foot looks
         chain = thigh + turned(x=bend) @ shin
         upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
@@ -181,14 +181,14 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
     return max(missed)
 
 
-def _knee_angle(thigh, shin, distance):
+def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
     """The knee's angle at which hip and ankle are at the given distance."""
     wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
     cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     return float(np.arctan2(sine, cosine) + np.arccos(np.clip(wanted / np.hypot(cosine, sine), -1, 1)))
 
 
-def _frame(direction, across):
+def _frame(direction: Vector, across: Vector) -> Matrix:
     """Orthonormal columns: the direction, what of `across` is orthogonal to it, and their product."""
     u = direction / np.linalg.norm(direction)
     s = across - (across @ u) * u
@@ -279,7 +279,7 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=1)
-def _fixed(template_bytes: bytes):
+def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])

@@ -138,7 +138,13 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
     return np.round(255 * fill_gaps(colors, known)).astype(np.uint8)
 
 
-def _write_mesh(folder: Path, vertices: Float[np.ndarray, "u 3"], baked, texture, formats):
+def _write_mesh(
+    folder: Path,
+    vertices: Float[np.ndarray, "u 3"],
+    baked: BakedSubject,
+    texture: UInt8[np.ndarray, "t t 3"],
+    formats: Sequence[str],
+) -> None:
     import trimesh
     from PIL import Image
     from trimesh.visual import TextureVisuals
@@ -265,7 +271,7 @@ _STATIC = ("parents", "mirrored_joints", "split", "generator")
 _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
 
 
-def _check_arrays(arrays):
+def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     """Sizes that fit each other, real and finite numbers, indices that exist. Raises: Refused."""
     sizes = {}
     for name in _ARRAYS:
@@ -283,18 +289,18 @@ def _check_arrays(arrays):
     check_indices("mirrored_joints", arrays["mirrored_joints"], (sizes["j"],), sizes["j"])
 
 
-def _check_range(seeds, split, where=""):
+def _check_range(seeds: Sequence[int], split: str, where: str = "") -> None:
     for seed in seeds:
         if split_of(seed) != split:
             raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
 
 
 @functools.cache
-def _shipped_body():
+def _shipped_body() -> BodyModel:
     return load_body()
 
 
-def _person(seed, body=None, *, texture_size, pose_count):
+def _person(seed: int, body: BodyModel | None = None, *, texture_size: int, pose_count: int) -> dict[str, np.ndarray]:
     """One subject's share of the bank, unpadded: name -> array."""
     subject = make_subject(seed, _shipped_body() if body is None else body)
     baked = bake_subject(subject, texture_size, 2 if texture_size <= 512 else 1)  # fine patterns on coarse texels
@@ -310,10 +316,10 @@ def _person(seed, body=None, *, texture_size, pose_count):
     away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)  # of each pose from the others
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
-        "seeds": np.int32(seed),
+        "seeds": np.asarray(seed, np.int32),
         "betas": subject.betas,
         "joints": subject.build.joints.astype(np.float32),
-        "vertex_counts": np.int32(len(surface.vertices)),
+        "vertex_counts": np.asarray(len(surface.vertices), np.int32),
         "vertices": surface.vertices.astype(np.float32),
         "normals": vertex_normals(surface.vertices, surface.faces).astype(np.float16),
         "joint_ids": joint_ids,
@@ -333,7 +339,7 @@ def _person(seed, body=None, *, texture_size, pose_count):
 _BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")
 
 
-def _stacked(people, body: BodyModel, split) -> PeopleBank:
+def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
     vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
     faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
 

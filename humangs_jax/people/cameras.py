@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float, Int, Matrix3, Scalar, Vector3
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
 from humangs_jax.people.anatomy import Vector
 from humangs_jax.people.surfaces import Points
@@ -70,14 +70,23 @@ def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, 
     return _orbits(targets, distances, azimuths, elevations, image_size)
 
 
-def _orbits(targets, distances, azimuths, elevations, size):
+def _orbits(
+    targets: Float[np.ndarray, "v 3"], distances: Angles, azimuths: Angles, elevations: Angles, size: int
+) -> Camera:
     """A batch of cameras that each look at a target of their own."""
     placed = (jnp.asarray(x, jnp.float32) for x in (targets, distances, azimuths, elevations))
     return _placed(*placed, intrinsics_from_fov(VERTICAL_FOV, size, size), size)
 
 
 @functools.partial(jax.jit, static_argnums=5)
-def _placed(targets, distances, azimuths, elevations, K, size):
+def _placed(
+    targets: Float[Array, "v 3"],
+    distances: Float[Array, " v"],
+    azimuths: Float[Array, " v"],
+    elevations: Float[Array, " v"],
+    K: Matrix3,
+    size: int,
+) -> Camera:
     one = lambda target, *rest: orbit(target, *(x[None] for x in rest), K, size, size)[0]
     return jax.vmap(one)(targets, distances, azimuths, elevations)
 
@@ -108,28 +117,30 @@ def camera_from(
     return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)
 
 
-def _nearest_distance(ahead, above, aside):
+def _nearest_distance(ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]) -> Scalar:
     """Least distance from the origin at which a camera that looks at it has all points in its square frame."""
     return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead)
 
 
 @jax.jit
-def _nearest_distances(points, azimuths, elevations):
+def _nearest_distances(
+    points: Float[Array, "n 3"], azimuths: Float[Array, " v"], elevations: Float[Array, " v"]
+) -> Float[Array, " v"]:
     return jax.vmap(lambda a, e: _nearest_distance(*_along_axes(points, a, e)))(azimuths, elevations)
 
 
-def _within(limits, share):
+def _within(limits: tuple[float, float] | Float[np.ndarray, "2"], share: Scalar) -> Scalar:
     return limits[0] + (limits[1] - limits[0]) * share
 
 
-def _axes(azimuth, elevation):
+def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3]:
     """Unit vectors towards a camera, up and right in its image."""
     sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
     zero = jnp.zeros_like(sa)
     return jnp.stack([ce * sa, se, ce * ca]), jnp.stack([-se * sa, ce, -se * ca]), jnp.stack([ca, zero, -sa])
 
 
-def _along_axes(points, azimuth, elevation):
+def _along_axes(points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar) -> tuple[Float[Array, " n"], ...]:
     """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and TPU."""
     return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
 

@@ -1,13 +1,14 @@
 """Skin, face, eyes and hair colors, painted in template coordinates so that they sit on the features of every shape."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
 from humangs_jax.people.fabrics import Material, Spots, band, color, mix
 from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, beard_field
 from humangs_jax.people.outfits import drawn
-from humangs_jax.people.surfaces import Ripples, lattice
+from humangs_jax.people.surfaces import Field, Points, Ripples, lattice
 
 EYE_X, EYE_Y, MOUTH_Y, HAND_Y = 0.029, 0.330, 0.2629, 0.085
 """Places in template coordinates; the last parts the backs of the hands from the palms."""
@@ -114,16 +115,16 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
     return Material(albedo, wrinkles=0.0, sheen=0.25)
 
 
-def _bell(*axes):
+def _bell(*axes: tuple[Field, Field | float | int, float]) -> Field:
     """(n,) 1 at a place, running out around it; axes: (coordinate (n,), place, width) of each."""
     return np.exp(-sum(((x - place) / width) ** 2 for x, place, width in axes))
 
 
-def _tinted(colors, tint, amount):
+def _tinted(colors: Points, tint: tuple[float, float, float], amount: Field) -> Points:
     return mix(colors, colors * np.asarray(tint), amount)
 
 
-def _hand(tones, result, x, y):
+def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
     """Palms are paler, knuckles and finger tips redder."""
     palm = np.clip((HAND_Y - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
@@ -131,7 +132,16 @@ def _hand(tones, result, x, y):
     return _tinted(mix(result, pale, 0.55 * palm), (0.98, 0.82, 0.8), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
 
 
-def _cheeks_and_eyes(tones, features, result, x, y, front, template, seed):
+def _cheeks_and_eyes(
+    tones: Complexion,
+    features: Mapping[str, float],
+    result: Points,
+    x: Field,
+    y: Field,
+    front: Field,
+    template: Points,
+    seed: int,
+) -> Points:
     """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
     cheeks = _bell((x, 0.043, 0.02), (y, 0.292, 0.018))
     nose = 0.7 * _bell((x, 0, 0.012 * features["nose"]), (y, 0.295, 0.012))
@@ -153,7 +163,7 @@ def _cheeks_and_eyes(tones, features, result, x, y, front, template, seed):
     return mix(result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1))
 
 
-def _aged(tones, result, x, y, front):
+def _aged(tones: Complexion, result: Points, x: Field, y: Field, front: Field) -> Points:
     """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
     if tones.wrinkles <= 0:
         return result
@@ -167,7 +177,17 @@ def _aged(tones, result, x, y, front):
     return _tinted(result, (0.68, 0.58, 0.55), np.clip(tones.wrinkles * front * (0.7 * lines + 0.45 * bags), 0, 0.8))
 
 
-def _mouth_and_brows(tones, haircut, features, result, x, y, front, template, seed):
+def _mouth_and_brows(
+    tones: Complexion,
+    haircut: Haircut,
+    features: Mapping[str, float],
+    result: Points,
+    x: Field,
+    y: Field,
+    front: Field,
+    template: Points,
+    seed: int,
+) -> Points:
     """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows there."""
     width, ahead = 0.026 * features["lip_width"], template[:, 2] > 0.08
     corner = np.clip(1 - (x / width) ** 2, 0, 1)

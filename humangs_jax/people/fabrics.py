@@ -8,11 +8,11 @@ whenever it is asked for colors. Periods of patterns are metres on the cloth; th
 import colorsys
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, Vector, sewn_coordinates
 from humangs_jax.people.surfaces import Field, Points, Ripples, choice, hashed, lattice
 
@@ -52,7 +52,7 @@ class Spots:
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
 
     @property
-    def _on_trunk(self):
+    def _on_trunk(self) -> Bool[np.ndarray, " n"]:
         """(n,) whether this is cloth of a trunk, inside of the armholes."""
         return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (np.abs(self.template[:, 0]) <= ARMHOLE)
 
@@ -82,8 +82,8 @@ DYES = {
 """Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two numbers."""
 
 
-def _color_of(rng, ranges):
-    return color(*(rng.uniform(*values) if len(values) == 2 else rng.choice(values) for values in ranges))
+def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]]) -> Vector:
+    return color(*(rng.uniform(values[0], values[1]) if len(values) == 2 else rng.choice(values) for values in ranges))
 
 
 def random_color(rng: np.random.Generator) -> Vector:
@@ -170,7 +170,7 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
     return Fabric(pattern, base, accent(rng, base), int(rng.integers(1 << 31)))
 
 
-def _dye(rng, kind):
+def _dye(rng: np.random.Generator, kind: str) -> Vector:
     """A usual color of a kind of garment, or any."""
     cloth, odds = CLOTHS.get(kind, ("cotton", 0.0))
     for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLORS):
@@ -179,17 +179,17 @@ def _dye(rng, kind):
     return random_color(rng)
 
 
-def _lines(x, period, width, shift=0.0):
+def _lines(x: Field, period: float, width: float, shift: float = 0.0) -> Field:
     """(n,) 1 on lines of a width that are a period apart, metres; shift: in periods."""
     return band((x / period + shift) % 1 * period, 0, width)
 
 
-def _grain(s, around, along, seed):
+def _grain(s: Spots, around: float, along: float, seed: int) -> Field:
     """(n,) lattice noise in cells of around x along metres."""
     return lattice(np.stack([s.around / around, s.along / along], -1), seed)
 
 
-def _seed(rng):
+def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1 << 20))
 
 

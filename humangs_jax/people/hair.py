@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.people import surfaces
-from humangs_jax.people.anatomy import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3, Anatomy, smoothstep
+from humangs_jax.people.anatomy import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3, Anatomy, Vector, smoothstep
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
 from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, boundaries, cut, rigid, ripples, smooth
 from humangs_jax.people.tailoring import finished, nearest_weights
@@ -287,7 +288,7 @@ def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     return finished(surface.moved(surface.vertices + grown[:, None] * normals), 2, 0.002)
 
 
-def _painted(surface):
+def _painted(surface: Surface) -> Surface:
     """Template and cloth coordinates of hair that does not come from the scalp: its own position."""
     flat = surface.vertices - surface.vertices.mean(0)
     return surface.painted(flat + SKULL, flat, 0.09)
@@ -305,7 +306,7 @@ def eyeballs(anatomy: Anatomy) -> Surface:
     return surfaces.join(parts)
 
 
-def _skull(anatomy):
+def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
     """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at rest."""
     neck = anatomy.joints[NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
@@ -313,7 +314,7 @@ def _skull(anatomy):
     return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
 
 
-def _falling_weights(anatomy, vertices, template_y):
+def _falling_weights(anatomy: Anatomy, vertices: Points, template_y: Field) -> Float[np.ndarray, "n j"]:
     """Weights of the head above the jaw, blending into those of the nearest skin further down."""
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
-from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
@@ -35,11 +35,13 @@ from humangs_jax.people.anatomy import MIRROR
 from humangs_jax.people.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
 from humangs_jax.people.cameras import pick
 from humangs_jax.people.subject import SPLITS, subject_key
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
 MIXING = 0.5
 """Largest share of the way to the nearest pose; the other half of the way is reached from that pose."""
+Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
+"""Of views: numbers for cameras, azimuths, poses, shares of close cameras."""
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 
@@ -119,7 +121,7 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
     return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
 
 
-def _draw_numbers(bank, key, config):
+def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[str, Float[Array, "..."]]:
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
     shapes = {"person": (), "poses": (config.poses, 2), "lights": (shading.LIGHT_NUMBERS,), "dyed": ()}
     shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
@@ -170,7 +172,7 @@ def pose_person(
     return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
 
 
-def _plans(numbers, config):
+def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig) -> tuple[Plan, Plan]:
     """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,)."""
     azimuths = cameras.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
     own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
@@ -181,7 +183,7 @@ def _plans(numbers, config):
     return inputs, (numbers["target_cameras"], anywhere, other, close)
 
 
-def _views(bank, scene, plan, config, size):
+def _views(bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, size: int) -> SubjectViews:
     """Views of some of the scene's poses."""
 
     def view(plan):
@@ -199,7 +201,7 @@ def _views(bank, scene, plan, config, size):
     return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
 
 
-def _some(views, part):
+def _some(views: SubjectViews, part: slice) -> SubjectViews:
     """Views of a range; betas have no axis of views."""
     return replace(jax.tree.map(lambda x: x[part], replace(views, betas=None)), betas=views.betas)
 
@@ -222,13 +224,20 @@ def draw_view(
     return _box_average(colors, camera, s), coverage, safe_divide(z, coverage)
 
 
-def _box_average(samples, camera, s):
+def _box_average(samples: Float[Array, "samples c"], camera: Camera, s: int) -> Float[Array, "h w c"]:
     """Means (h, w, c) of s x s samples (h s w s, c); added one by one: XLA's CPU backend reduces two axes slowly."""
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
-    return sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / (s * s)
+    return jnp.asarray(sum(samples[:, i, :, j] for i in range(s) for j in range(s))) / (s * s)
 
 
-def _light_pixels(bank, scene, corners, behind, fragments, step):
+def _light_pixels(
+    bank: PeopleBank,
+    scene: Scene,
+    corners: Float[Array, "f 15"],
+    behind: Bool[Array, " f"],
+    fragments: Fragments,
+    step: int,
+) -> Float[Array, "hw 3"]:
     """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at a time."""
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
     covered = ids >= 0
@@ -250,7 +259,14 @@ def _light_pixels(bank, scene, corners, behind, fragments, step):
     return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
 
 
-def _color_points(bank, scene, corners, faces, weights, behind):
+def _color_points(
+    bank: PeopleBank,
+    scene: Scene,
+    corners: Float[Array, "p 15"],
+    faces: Int[Array, " p"],
+    weights: Float[Array, "p 3"],
+    behind: Bool[Array, " p"],
+) -> Float[Array, "p 3"]:
     """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
@@ -264,7 +280,9 @@ def _color_points(bank, scene, corners, faces, weights, behind):
     return shading.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
-def _sample(texture, person, at):
+def _sample(
+    texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]
+) -> Float[Array, "p 6"]:
     """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
     size = texture.shape[1]
     at = jnp.clip(at * size - 0.5, 0, size - 1)
@@ -332,7 +350,7 @@ class GeneratedSource:
         """The key of the index-th example of a run: a random subject of the split, in its index-th appearance."""
         return subject_key(self._person(seed, index), index)
 
-    def _person(self, seed, index):
+    def _person(self, seed: int, index: int) -> int:
         people = SPLITS[self.split]
         return people[int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))]
 
@@ -352,7 +370,7 @@ def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_F
 
 
 @functools.cache
-def _compiled():
+def _compiled() -> Callable[..., Example]:
     return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=compiler_options())
 
 

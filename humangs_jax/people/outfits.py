@@ -6,7 +6,7 @@ seed makes, so raise `seeds.GENERATOR_VERSION` with it.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -180,12 +180,14 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     return tuple(worn)
 
 
-def _made(rng, kind, plainness, details=(), **sizes):
+def _made(
+    rng: np.random.Generator, kind: str, plainness: float, details: Iterable[str] = (), **sizes: float
+) -> Garment:
     """A garment in a random fabric."""
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
 
-def _separates(rng, name, male, outer):
+def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
     style = STYLES[name]
     kind = drawn(rng, style.tops)
     kind = "shirt" if male and kind == "blouse" else kind
@@ -200,7 +202,9 @@ def _separates(rng, name, male, outer):
     return [top, lower]
 
 
-def _top(rng, style, kind, male, waist, tucked, outer):
+def _top(
+    rng: np.random.Generator, style: str, kind: str, male: bool, waist: float, tucked: bool, outer: bool
+) -> Garment:
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
     sleeve = row(rng, SLEEVES, kind, long=long, short=short)
     details = {row(rng, MENS_NECKS if male else NECKS, kind)}
@@ -224,7 +228,7 @@ def _top(rng, style, kind, male, waist, tucked, outer):
     return _made(rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth)
 
 
-def _trousers(rng, style, male, waist, tucked, top):
+def _trousers(rng: np.random.Generator, style: Style, male: bool, waist: float, tucked: bool, top: Garment) -> Garment:
     kind = drawn(rng, style.bottoms)
     if kind == "leggings" and male and rng.random() < 0.7:
         kind = "shorts"
@@ -240,20 +244,20 @@ def _trousers(rng, style, male, waist, tucked, top):
     return _made(rng, kind, 0.75, details, **sizes)
 
 
-def _skirt(rng, waist, tucked):
+def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
     end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
     flare = rng.uniform(0.0, 0.05) if rng.random() < 0.35 and kind != "pleated_skirt" else rng.uniform(0.05, 0.16)
     sizes = {"top": waist, "end": end, "flare": flare, "waist": waist, "tucked": float(tucked), **_pleats(rng, kind)}
-    return _made(rng, kind, 0.35, **sizes)
+    return _made(rng, kind, 0.35, (), **sizes)
 
 
-def _pleats(rng, kind):
+def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
     count, depth = ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
     return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
 
 
-def _dress(rng, outer):
+def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
     sleeve = float(drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25))))
@@ -263,7 +267,7 @@ def _dress(rng, outer):
     return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
 
 
-def _outer(rng, style, worn):
+def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> Garment:
     kind = drawn(rng, style.coats)
     is_open = rng.random() < COAT_OPEN.get(kind, 0.75)
     bottom = row(rng, COAT_ENDS, kind)
@@ -284,7 +288,7 @@ def _outer(rng, style, worn):
     return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
 
 
-def _shoes(rng, style, male, worn):
+def _shoes(rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Garment]) -> list[Garment]:
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)
     covered = lower.kind in BOTTOMS and lower.sizes["end"] < -1.0
@@ -299,7 +303,7 @@ def _shoes(rng, style, male, worn):
     return [*result, _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots"))]
 
 
-def _fastened(rng, style, male, worn):
+def _fastened(rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]) -> list[Garment]:
     """Belt and tie: worn below what is worn outside."""
     result = []
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
@@ -313,7 +317,7 @@ def _fastened(rng, style, male, worn):
     return result
 
 
-def _extras(rng, style, male, years, worn):
+def _extras(rng: np.random.Generator, style: Style, male: bool, years: float, worn: Sequence[Garment]) -> list[Garment]:
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)
     result: list[Garment] = []

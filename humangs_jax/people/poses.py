@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.people import anatomy as kin
 from humangs_jax.people.surfaces import choice
 
@@ -23,6 +24,10 @@ HAND_LENGTH = 0.6
 HEAD_RADIUS = 0.14
 MARGIN = 0.015
 """Metres that forearm and hand keep away from the body."""
+
+
+Capsule = tuple[kin.Vector, kin.Vector, float]
+"""Two ends and a radius, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +76,14 @@ def in_world(feet: kin.Feet, leg: float, heading: float) -> kin.Feet:
     return placed[0], placed[1]
 
 
-def _pair(rng, width, *, spread=(0.0, 0.08), apart=(0.0, 0.06), turn_out=(-0.05, 0.35)):
+def _pair(
+    rng: np.random.Generator,
+    width: float,
+    *,
+    spread: tuple[float, float] = (0.0, 0.08),
+    apart: tuple[float, float] = (0.0, 0.06),
+    turn_out: tuple[float, float] = (-0.05, 0.35),
+) -> list[kin.Foot]:
     """Two flat feet about as far apart as the hips."""
     feet = []
     for sign in (1, -1):
@@ -80,11 +92,11 @@ def _pair(rng, width, *, spread=(0.0, 0.08), apart=(0.0, 0.06), turn_out=(-0.05,
     return feet
 
 
-def _stand(rng, width):
+def _stand(rng: np.random.Generator, width: float) -> Stance:
     return Stance(tuple(_pair(rng, width)), sink=rng.uniform(0.0, 0.015), roll=rng.normal(0, 0.02))
 
 
-def _contrapposto(rng, width):
+def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
     feet, relaxed = _pair(rng, width), int(rng.integers(2))
     sign = 1 if relaxed == 0 else -1
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
@@ -95,7 +107,7 @@ def _contrapposto(rng, width):
     return Stance(tuple(feet), sink=rng.uniform(0.0, 0.01), roll=-sign * rng.uniform(0.03, 0.12))
 
 
-def _stride(rng, width):
+def _stride(rng: np.random.Generator, width: float) -> Stance:
     feet, front = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)), int(rng.integers(2))
     length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
     feet[front] = dataclasses.replace(feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4))
@@ -104,33 +116,33 @@ def _stride(rng, width):
     return Stance(tuple(feet), sink=rng.uniform(0.0, 0.04), tilt=rng.uniform(0, 0.08), lean=rng.uniform(0, 0.1))
 
 
-def _wide(rng, width):
+def _wide(rng: np.random.Generator, width: float) -> Stance:
     feet = _pair(rng, width, spread=(0.12, 0.35), turn_out=(0.05, 0.5))
     return Stance(tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03))
 
 
-def _squat(rng, width):
+def _squat(rng: np.random.Generator, width: float) -> Stance:
     depth, feet = rng.uniform(0.08, 0.42), _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6))
     heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
     feet = [dataclasses.replace(foot, pitch=heels, z=foot.z + 0.06) for foot in feet]
     return Stance(tuple(feet), sink=depth, tilt=0.6 * depth, lean=1.4 * depth)
 
 
-def _lunge(rng, width):
+def _lunge(rng: np.random.Generator, width: float) -> Stance:
     feet, front = _pair(rng, width, turn_out=(-0.05, 0.2)), int(rng.integers(2))
     feet[front] = dataclasses.replace(feet[front], z=rng.uniform(0.4, 0.7))
     feet[1 - front] = dataclasses.replace(feet[1 - front], z=-rng.uniform(0.4, 0.75), pitch=rng.uniform(0.55, 0.85))
     return Stance(tuple(feet), sink=rng.uniform(0.05, 0.3), tilt=rng.uniform(0, 0.15), lean=rng.uniform(-0.1, 0.3))
 
 
-def _side_lunge(rng, width):
+def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
     feet, bent = _pair(rng, width, spread=(0.2, 0.4), turn_out=(0.1, 0.5)), int(rng.integers(2))
     sign = 1 if bent == 0 else -1
     feet = [dataclasses.replace(foot, x=foot.x - sign * rng.uniform(0.1, 0.3)) for foot in feet]
     return Stance(tuple(feet), sink=rng.uniform(0.02, 0.2), tilt=rng.uniform(0.05, 0.2), lean=rng.uniform(0, 0.3))
 
 
-def _one_leg(rng, width):
+def _one_leg(rng: np.random.Generator, width: float) -> Stance:
     """One foot in the air: a raised knee, a kick, a foot behind."""
     feet, raised = _pair(rng, width), int(rng.integers(2))
     sign = 1 if raised == 0 else -1
@@ -150,7 +162,7 @@ def _one_leg(rng, width):
     return Stance(tuple(feet), sink=sink, roll=roll, lean=rng.uniform(-0.05, 0.1))
 
 
-def _tiptoe(rng, width):
+def _tiptoe(rng: np.random.Generator, width: float) -> Stance:
     pitch = rng.uniform(0.3, 0.8)
     feet = [dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)]
     return Stance(tuple(feet), sink=rng.uniform(0, 0.03))
@@ -259,7 +271,7 @@ def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
     return float(worst)
 
 
-def _body_capsules(build, world, positions):
+def _body_capsules(build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations) -> list[Capsule]:
     """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
     sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
     top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
@@ -273,14 +285,14 @@ def _body_capsules(build, world, positions):
     return capsules
 
 
-def _arm_capsules(build, positions, side):
+def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list[Capsule]:
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
     radius = build.arm_radius + 0.01
     return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
 
 
-def _clearance(build, capsules, points):
+def _clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -290,7 +302,7 @@ def _clearance(build, capsules, points):
     return np.min(distances, axis=0) - build.arm_radius
 
 
-def _along(elbows, wrists):
+def _along(elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]) -> list[Float[np.ndarray, "*n 3"]]:
     """Points of the forearm and the hand that must not touch the body."""
     tips = wrists + HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]

@@ -13,7 +13,17 @@ from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import anatomy as kin
-from humangs_jax.people.poses import ARMS, STANCES, arm_clearance, bend_arm, bend_trunk, draw_goal, in_world, pose_hand
+from humangs_jax.people.poses import (
+    ARMS,
+    STANCES,
+    Stance,
+    arm_clearance,
+    bend_arm,
+    bend_trunk,
+    draw_goal,
+    in_world,
+    pose_hand,
+)
 from humangs_jax.people.surfaces import choice
 
 FPS, LONG_STEP = 30.0, 0.75
@@ -26,6 +36,16 @@ SMOOTHING, SPARE = 4, 0.995
 """Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it uses."""
 TRIES = 12
 """Goals tried for an arm until the way to one is clear."""
+
+
+Heading = Callable[[float | np.ndarray], float | np.ndarray]
+"""From the phase, in strides, to the angle about y."""
+Track = Callable[[float], kin.Vector]
+"""From the phase to the body's place on its path."""
+Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
+"""Rotations, positions of the pelvis, feet that are planted."""
+KeyPose = tuple[kin.Rotations, kin.Vector, float]
+"""Rotations, place of the pelvis on the ground plane, how much lower it is than it could be."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +89,7 @@ class Gait:
     swing: float
 
 
-def _walk(rng, build, frames):
+def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
     cadence, bend = rng.uniform(0.75, 1.05), rng.normal(0, 0.16) if curved else 0.0
     width, lift, turn_out = build.hip_width * rng.uniform(0.5, 0.9), rng.uniform(0.04, 0.09), rng.uniform(0.0, 0.18)
@@ -77,14 +97,14 @@ def _walk(rng, build, frames):
     return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
-def _turn(rng, build, frames):
+def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
     bend, width = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5), build.hip_width * rng.uniform(0.95, 1.3)
     lift, turn_out, swing = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.2), rng.uniform(0.03, 0.15)
     return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
-def _step_along(rng, build, frames, gait):
+def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: Gait) -> Moves:
     start = rng.uniform(0, 1)
     begin_heading = rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
     phase = start + gait.cadence * (np.arange(frames) / FPS)  # strides; two steps each
@@ -116,7 +136,7 @@ def _step_along(rng, build, frames, gait):
     return rotations, pelvis, planted
 
 
-def _path(heading, stride, first, last):
+def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
     """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
@@ -126,7 +146,7 @@ def _path(heading, stride, first, last):
     return lambda p: stride * (at(p) - origin)
 
 
-def _foot_at(build, gait, heading, track, side, phase):
+def _foot_at(build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, phase: float) -> kin.Foot:
     """The foot of a side at a phase (strides); the left one comes down at whole phases, the right one half a stride later."""
     number, share = divmod(phase + 0.5 * side, 1.0)
     down = number - 0.5 * side
@@ -145,16 +165,22 @@ def _foot_at(build, gait, heading, track, side, phase):
     return kin.Foot(*at, pitch=float(pitch), lift=float(gait.lift * np.sin(np.pi * s) ** 2))
 
 
-def _footprint(build, gait, heading, track, side, down):
+def _footprint(build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, down: float) -> kin.Foot:
     """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in mid-stance."""
     middle = down + 0.5 * STANCE_SHARE
-    yaw, sign = heading(middle), 1 - 2 * side
+    yaw, sign = float(heading(middle)), 1 - 2 * side
     ahead = build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg  # of the ball, standing
     x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
     return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
 
 
-def _swing_arms(rng, build, rotations, phase, gait):
+def _swing_arms(
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: Float[np.ndarray, "m j 3"],
+    phase: Float[np.ndarray, " m"],
+    gait: Gait,
+) -> None:
     """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of the shoulders."""
     stood = rotations[0].copy()
     stood[[joint for leg in kin.LEGS for joint in leg]] = 0
@@ -175,7 +201,7 @@ def _swing_arms(rng, build, rotations, phase, gait):
         rotations[:, wrist], rotations[:, hand] = stood[wrist], stood[hand]
 
 
-def _reach(rng, build, frames):
+def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
     """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
@@ -199,7 +225,9 @@ def _reach(rng, build, frames):
     return rotations, pelvis, np.ones((frames, 2), bool)
 
 
-def _key_pose(rng, build, heading, stance, feet, before):
+def _key_pose(
+    rng: np.random.Generator, build: kin.Build, heading: float, stance: Stance, feet: kin.Feet, before: KeyPose | None
+) -> KeyPose:
     """(rotations, place of the pelvis on the ground plane, how much lower it is than it could be)."""
     rotations = np.zeros((kin.JOINTS, 3))
     sink = stance.sink * build.leg + (rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0)
@@ -231,7 +259,7 @@ def _key_pose(rng, build, heading, stance, feet, before):
     return rotations, center, sink
 
 
-def _clear_of(build, rotations, side):
+def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
     """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the way."""
     if side == 0:
         rotations = rotations.copy()
@@ -239,7 +267,13 @@ def _clear_of(build, rotations, side):
     return arm_clearance(build, rotations)
 
 
-def _ride(build, turns, centers, feet, sinks=None):
+def _ride(
+    build: kin.Build,
+    turns: Float[np.ndarray, "m 3 3"],
+    centers: Float[np.ndarray, "m 3"],
+    feet: list[kin.Feet],
+    sinks: Float[np.ndarray, " m"] | None = None,
+) -> Float[np.ndarray, "m 3"]:
     """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus `sinks`."""
     heights = np.asarray([
         kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
@@ -254,11 +288,13 @@ def _ride(build, turns, centers, feet, sinks=None):
     return pelvis
 
 
-def _ease(t):
+def _ease(t: float) -> float:
     """From 0 to 1 with rest at both ends (speed and acceleration)."""
     t = np.clip(t, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
-KINDS: dict[str, tuple[float, Callable]] = {"walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach)}
-"""Name -> probability, and a function of a generator, a build and a length: (rotations, positions of the pelvis, planted)."""
+KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], Moves]]] = {
+    "walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach),
+}  # fmt: skip
+"""Name -> probability, and a function of a generator, a build and a length."""

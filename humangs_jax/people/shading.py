@@ -5,6 +5,7 @@ shadow of the key light are per vertex, from a voxel grid that holds the posed p
 """
 
 import math
+from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
@@ -99,7 +100,17 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     return _lights(jnp, angles, elevations, power, tint, warmth, color, ground, gain)
 
 
-def _lights(numpy, angles, elevations, power, tint, warmth, sky, ground, gain):
+def _lights(
+    numpy: ModuleType,
+    angles: Float[Array | np.ndarray, " k"],
+    elevations: Float[Array | np.ndarray, " k"],
+    power: Float[Array | np.ndarray, " k"],
+    tint: Float[Array | np.ndarray, "k 3"],
+    warmth: Float[Array, ""] | float,
+    sky: Float[Array | np.ndarray, "3"],
+    ground: Float[Array | np.ndarray, "3"],
+    gain: Float[Array | np.ndarray, "3"],
+) -> Lights:
     """numpy: the module of the arrays' kind."""
     flat = numpy.cos(elevations)
     directions = numpy.stack([flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1)
@@ -131,7 +142,7 @@ def shaded_vertices(
     return openness, jnp.maximum(jnp.exp(-SHADOW_DENSITY * found), DARKEST)
 
 
-def _blurred(grid):
+def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
     """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one huge expression."""
     for axis, size in enumerate(GRID):
         apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
@@ -140,7 +151,7 @@ def _blurred(grid):
     return grid
 
 
-def _nearest(grid, at):
+def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the grid."""
     x, y, z = jnp.round(at).astype(jnp.int32).T
     size = jnp.asarray(GRID)
@@ -149,7 +160,7 @@ def _nearest(grid, at):
     return jnp.where(inside, grid.reshape(-1)[jnp.where(inside, index, 0)], 0.0)
 
 
-def _trilinear(grid, at):
+def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which is empty."""
     base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
     t = jnp.clip(at - base, 0, 1)
@@ -213,7 +224,7 @@ def rolled_off(colors: Vectors) -> Vectors:
     return jnp.minimum(colors, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach))
 
 
-def _unit(vectors):
+def _unit(vectors: Vectors) -> Vectors:
     return vectors / (jnp.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-9)
 
 

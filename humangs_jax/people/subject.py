@@ -20,6 +20,7 @@ from humangs_jax.people.anatomy import (
     BODY_NAME,
     BODY_VERTICES,
     LEFT_KNEE,
+    Anatomy,
     Build,
     Rotations,
     Vector,
@@ -225,7 +226,9 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
 _HOST: dict[int, tuple] = {}
 
 
-def _host_arrays(body):
+def _host_arrays(
+    body: BodyModel,
+) -> tuple[Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]]:
     """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds. Kept for the body used last."""
     if id(body) not in _HOST:
         template, faces, weights = (np.asarray(a) for a in (body.template, body.faces, body.skinning_weights))
@@ -237,7 +240,9 @@ def _host_arrays(body):
     return _HOST[id(body)][1:]
 
 
-def _hair(rng, anatomy, person, over, hooded):
+def _hair(
+    rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool
+) -> list[wardrobe.Piece]:
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
     haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
@@ -249,7 +254,7 @@ def _hair(rng, anatomy, person, over, hooded):
     return pieces
 
 
-def _build(anatomy, surface):
+def _build(anatomy: Anatomy, surface: Surface) -> Build:
     """Radii of the dressed body for the pose prior."""
     chest = anatomy.trunk.radii[(anatomy.trunk.levels > -0.35) & (anatomy.trunk.levels < 0.0)]
     depth = float(np.median(0.5 * (chest[:, 0] + chest[:, chest.shape[1] // 2])))

@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.people import surfaces
 from humangs_jax.people.anatomy import (
     ANKLE,
@@ -21,7 +22,7 @@ from humangs_jax.people.anatomy import (
     sewn_coordinates,
     smoothstep,
 )
-from humangs_jax.people.surfaces import Field, Points, Surface, blurred, hanging, polar, ripples, smooth
+from humangs_jax.people.surfaces import Boundaries, Field, Points, Surface, blurred, hanging, polar, ripples, smooth
 
 TRUNK_HALF_WIDTH = 0.25
 """In T-pose everything further out than this is an arm."""
@@ -191,7 +192,7 @@ def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> n
     return smoothed / smoothed.sum(1, keepdims=True)
 
 
-def _drape(rng, anatomy, surface, fit):
+def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fit) -> Surface:
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
     points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
@@ -231,7 +232,7 @@ def _drape(rng, anatomy, surface, fit):
     return surface.moved(points).with_attributes(cloth=cloth, template=template)
 
 
-def _fold_heights(rng, cloth, arm, leg, fit):
+def _fold_heights(rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit) -> Field:
     """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
     along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
     heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
@@ -252,14 +253,22 @@ def _fold_heights(rng, cloth, arm, leg, fit):
     return heights
 
 
-def _push(points, across, along, boundary, amount, ease, extra):
+def _push(
+    points: Points,
+    across: tuple[int, int],
+    along: Field,
+    boundary: Boundaries,
+    amount: Field,
+    ease: float,
+    extra: Field,
+) -> Points:
     """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,) on it; across: other axes."""
-    center, across = boundary.center(along), list(across)
-    angle, radius = polar(points[:, across], center)
+    center, axes = boundary.center(along), list(across)
+    angle, radius = polar(points[:, axes], center)
     missing = np.maximum(boundary.radius(along, angle) + ease + extra - radius, 0)
     scale = 1 + amount * missing / np.maximum(radius, 1e-4)
     points = points.copy()
-    points[:, across] = center + (points[:, across] - center) * scale[:, None]
+    points[:, axes] = center + (points[:, axes] - center) * scale[:, None]
     return points
 
 
@@ -306,7 +315,7 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
     return inside + np.minimum(below, 0) + np.maximum(above, 0)
 
 
-def _skirt_weights(anatomy, vertices, template_y):
+def _skirt_weights(anatomy: Anatomy, vertices: Points, template_y: Field) -> Float[np.ndarray, "n j"]:
     """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's side further down."""
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]

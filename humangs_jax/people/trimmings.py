@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people.anatomy import ARMHOLE, WAIST
 from humangs_jax.people.fabrics import Spots, accent, band, color, mix
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, TOPS, Garment
@@ -102,17 +102,17 @@ def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
     return np.minimum(0.28 - np.abs(slant), 1 - np.abs(y))  # bolt
 
 
-def _trunk(s):
+def _trunk(s: Spots) -> Field:
     """(n,) 1 on the trunk, 0 on limbs."""
     return band(s.cloth[:, 3], 0.13, 1.0, 0.01)
 
 
-def _from_the_side(s):
+def _from_the_side(s: Spots) -> Field:
     """(n,) metres around the trunk or limb from its sides."""
     return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
 
 
-def _darker(colors, share, where):
+def _darker(colors: Points, share: float | Float[np.ndarray, "n 1"], where: Field) -> Points:
     return mix(colors, colors * share, where)
 
 
@@ -220,7 +220,7 @@ def zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment)
     return mix(_darker(colors, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
 
 
-def _boundary(x, y, half_width, half_height):
+def _boundary(x: Field, y: Field, half_width: float, half_height: float) -> Field:
     return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
 
 

@@ -1,7 +1,8 @@
 """Clothes built: every `Garment` becomes surfaces with materials, layer on layer, and hides what lies well below it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,12 +10,15 @@ from humangs_jax.people import accessories, tailoring, trimmings
 from humangs_jax.people.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
 from humangs_jax.people.fabrics import Material
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
-from humangs_jax.people.surfaces import Surface, compact
+from humangs_jax.people.surfaces import Field, Surface, compact
 from humangs_jax.people.tailoring import HEM_MARGIN, Fit, shell, skirt
 from humangs_jax.people.trimmings import PADDED, QUILT, sewn
 
 Cover = Callable[[np.ndarray], np.ndarray]
 """Template points (n, 3) -> (n,) metres inside of a garment's hems, negative outside."""
+
+Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
+"""A field of `tailoring` over template points, and its further arguments."""
 
 LAYER = 0.006
 """What one layer is further out than the one below it, metres."""
@@ -87,7 +91,16 @@ def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment
     return outfit
 
 
-def _put(rng, outfit, cuts, fit, material, margin=HEM_MARGIN, finish=lambda surface: surface, over=True):
+def _put(
+    rng: np.random.Generator,
+    outfit: Outfit,
+    cuts: Sequence[Cut],
+    fit: Fit,
+    material: Material,
+    margin: float = HEM_MARGIN,
+    finish: Callable[[Surface], Surface] = lambda surface: surface,
+    over: bool = True,
+) -> None:
     """A shell where all cuts (a function of template points, and its further arguments) are positive, and what it hides."""
     fields = lambda points: [field(points, *arguments) for field, *arguments in cuts]
     surface = finish(shell(rng, outfit.anatomy, fields(outfit.template), fit))
@@ -95,28 +108,50 @@ def _put(rng, outfit, cuts, fit, material, margin=HEM_MARGIN, finish=lambda surf
     outfit.add(surface, material)
 
 
-def _strip(rng, outfit, field, fit, material, layered=False):
+def _strip(
+    rng: np.random.Generator, outfit: Outfit, field: Field, fit: Fit, material: Material, layered: bool = False
+) -> None:
     """A shell that hides nothing. layered: see `Outfit.add`."""
     outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered)
 
 
-def _bodice(rng, outfit, garment, neck, depth, bottom, fit, material, margin, opening=()):
+def _bodice(
+    rng: np.random.Generator,
+    outfit: Outfit,
+    garment: Garment,
+    neck: str,
+    depth: float,
+    bottom: float,
+    fit: Fit,
+    material: Material,
+    margin: float,
+    opening: Sequence[Cut] = (),
+) -> None:
     """Cloth on trunk and arms from a neckline down to a height, the outermost so far. opening: further cuts."""
     cuts = [(tailoring.neckline, neck, depth), (tailoring.sleeves, garment.sizes["sleeve"]), (tailoring.above, bottom)]
     _put(rng, outfit, [*cuts, *opening], fit, material, margin)
     outfit.trunk, outfit.fit = fit.ease, fit
 
 
-def _neck(garment):
+def _neck(garment: Garment) -> str:
     return next(neck for neck in tailoring.NECKLINES if neck in garment.details)
 
 
-def _collar(rng, outfit, material, fit, extra=0.004, low=0.125, high=0.178, gap=0.012):
+def _collar(
+    rng: np.random.Generator,
+    outfit: Outfit,
+    material: Material,
+    fit: Fit,
+    extra: float = 0.004,
+    low: float = 0.125,
+    high: float = 0.178,
+    gap: float = 0.012,
+) -> None:
     cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
     _strip(rng, outfit, tailoring.collar(outfit.template, low, high, gap), cut_of, material)
 
 
-def _top(rng, outfit, garment):
+def _top(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     fit = Fit(
@@ -138,7 +173,7 @@ def _top(rng, outfit, garment):
         outfit.add(accessories.hood(rng, outfit.anatomy, "hood_up" in details), material, layered=False)
 
 
-def _outer(rng, outfit, garment):
+def _outer(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
     long, padded, blazer = kind == "coat", kind in PADDED, kind == "blazer"
@@ -179,7 +214,7 @@ def _outer(rng, outfit, garment):
 LEG_HANG = {"wide": 0.02, "slim": 1.0, "leggings": 3.0, "jeans": 0.12}
 
 
-def _trousers(rng, outfit, garment):
+def _trousers(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     sizes, kind = garment.sizes, garment.kind
     top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
     ease = outfit.trunk + 0.004 if tucked else 0.005
@@ -204,7 +239,7 @@ def _trousers(rng, outfit, garment):
         _let_hang_over(outfit, 0.03)
 
 
-def _let_hang_over(outfit, margin):
+def _let_hang_over(outfit: Outfit, margin: float) -> None:
     """An untucked top hides the last piece below it, except for a margin inside of the top's hem."""
     lower = outfit.pieces[-1]
     x, y, _ = lower.surface.template.T
@@ -212,7 +247,7 @@ def _let_hang_over(outfit, margin):
     outfit.pieces[-1] = dataclasses.replace(lower, hidden=lower.hidden | hidden)
 
 
-def _skirt(rng, outfit, garment):
+def _skirt(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     sizes, tucked = garment.sizes, garment.sizes["tucked"] > 0
     top, end = sizes["top"], sizes["end"]
     ease = outfit.trunk + 0.004 if tucked else 0.004
@@ -227,12 +262,12 @@ def _skirt(rng, outfit, garment):
         _let_hang_over(outfit, 0.055)
 
 
-def _hem_of(sizes):
+def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
     """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as a long one's; pleats."""
     return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 
 
-def _dress(rng, outfit, garment):
+def _dress(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     sizes, anatomy = garment.sizes, outfit.anatomy
     waist, end = sizes["waist"], sizes["end"]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
@@ -247,14 +282,14 @@ def _dress(rng, outfit, garment):
         _collar(rng, outfit, material, fit)
 
 
-def _socks(rng, outfit, garment):
+def _socks(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     ribs = lambda s: (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
     material = Material(lambda s: garment.fabric.colors(s) * ribs(s), wrinkles=0.1)
     fit = Fit(ease=0.003, fold=0.001, hem=0.003)
     _put(rng, outfit, [(tailoring.shaft, garment.sizes["height"])], fit, material, 0.008)
 
 
-def _shoes(rng, outfit, garment):
+def _shoes(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
     leather = lambda s: trimmings.leather(s, garment)
     material = Material(leather, sheen=0.2 if garment.kind != "sneakers" else 0.08)
@@ -270,7 +305,7 @@ def _shoes(rng, outfit, garment):
     outfit.add(surface, material, layered=False)
 
 
-def _unhidden_legs(piece):
+def _unhidden_legs(piece: Piece) -> Piece:
     """Trouser legs hang over low shoes: the shoe hides nothing of them, only socks."""
     if piece.hidden is None or piece.surface.template[:, 1].min() < -1.2:
         return piece
@@ -278,26 +313,26 @@ def _unhidden_legs(piece):
     return dataclasses.replace(piece, hidden=piece.hidden & ~low)
 
 
-def _belt(rng, outfit, garment):
+def _belt(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     top, width = garment.sizes["top"], garment.sizes["width"]
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
     material = Material(lambda s: trimmings.buckled(s, garment), sheen=0.15)
     _strip(rng, outfit, tailoring.trousers(outfit.template, top, top - width), fit, material, layered=True)
 
 
-def _tie(rng, outfit, garment):
+def _tie(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
     _strip(rng, outfit, field, fit, Material(garment.fabric.colors, sheen=0.15), layered=True)
 
 
-def _watch(rng, outfit, garment):
+def _watch(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
     _strip(rng, outfit, field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3))
 
 
-def _bag(rng, outfit, garment):
+def _bag(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
     on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
     if on_back:
@@ -314,7 +349,7 @@ def _bag(rng, outfit, garment):
     _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), strap)
 
 
-def _accessory(rng, outfit, garment):
+def _accessory(rng: np.random.Generator, outfit: Outfit, garment: Garment) -> None:
     for surface, material in accessories.build(rng, outfit.anatomy, garment, outfit.trunk):
         outfit.add(surface, material, layered=False)
 

@@ -10,6 +10,7 @@ out/SEED/scan/                       where asked for: the first pose as a lit, t
 import dataclasses
 import functools
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -37,11 +38,12 @@ from humangs_jax.data.sets import (
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan
-from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
+from humangs_jax.people.cameras import Angles, cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, seeds_of, split_of
+from humangs_jax.people.surfaces import Points
 
 HELD_OUT = "held_out"
 """Sub-folder of a subject's folder."""
@@ -207,7 +209,14 @@ def _write(body: BodyModel, folder: Path, seed: int, layout: Layout) -> None:
     write_person(folder, seed, body, layout)
 
 
-def _views(stream, place, count, poses, size, mark=""):
+def _views(
+    stream: Sequence[int],
+    place: Callable[[np.random.Generator, Points, Angles, int], Camera],
+    count: int,
+    poses: Sequence[PosedSubject],
+    size: int,
+    mark: str = "",
+) -> list[View]:
     """`count` views of each pose, from cameras that `place` finds."""
     rng, views = np.random.default_rng(stream), []
     for frame, posed in enumerate(poses if count else ()):
