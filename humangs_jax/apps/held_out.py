@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.core.array_types import PyTree
+from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.usable_views import usable_views
@@ -70,7 +70,7 @@ def better_body(
     return (second, two) if one is not None and two is not None and two.psnr > one.psnr + CLEARLY else (first, one)
 
 
-def _distances(capture):
+def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
     """Between the cameras, seen from the person; a photo is none of its own neighbours."""
     towards = np.asarray(capture.cameras.center) - np.asarray(capture.poses.translation)[np.asarray(capture.frames)]
     towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)

@@ -15,7 +15,7 @@ from humangs_jax.apps import detect
 from humangs_jax.apps.detect import PhotoPeople
 from humangs_jax.apps.start import photo_files
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
-from humangs_jax.data.calibration.importing import import_calibration
+from humangs_jax.data.calibration.importing import ImportReport, import_calibration
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, PersonViews, cameras_from_person
@@ -165,7 +165,7 @@ def _repaired(photo: PhotoPeople, number: int, mirrored: bool) -> PhotoPeople:
     return dataclasses.replace(photo, people=tuple(people))
 
 
-def _lines(seen, found, report):
+def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tuple[str, ...]:
     """What was found, for the user."""
     centers = np.asarray([camera.center for camera in found.cameras], float)
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))

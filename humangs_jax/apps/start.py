@@ -106,7 +106,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     return images, photos
 
 
-def _expect_folder(folder):
+def _expect_folder(folder: Path) -> None:
     if not folder.is_dir():
         wrong = "is a file" if folder.exists() else "no such folder"
         raise CaptureError(folder, "", f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEOS)})")
@@ -177,7 +177,7 @@ def find_photos(folder: Path) -> Iterator[Path]:
             yield from filter(is_photo, found)
 
 
-def _has_alpha(photo):
+def _has_alpha(photo: Path) -> bool:
     """Whether a photo has transparent pixels; an opaque alpha channel is no mask."""
     with open_image(photo) as (image, _):
         if "A" not in image.getbands() and "transparency" not in image.info:

@@ -143,7 +143,7 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
     return body, batch, fit_buffers(inputs, config), turned
 
 
-def _views(capture, body, config):
+def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[SubjectViews, bool]:
     """What the network gets of a capture; and whether its world has been turned."""
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
     views = upright(photos, capture.body)

@@ -23,6 +23,7 @@ it is known at which places a detector sees its landmarks, they are moved there:
 on this list: they follow expressions, which bodies without a face rig do not have.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -33,7 +34,7 @@ from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.skinning import SurfacePoints, pose_points, shaped
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
@@ -205,18 +206,18 @@ def landmark_model(
         known=known,
         parents=body.parents,
         joint_names=body.joint_names,
-        movers=_movers(body.parents, regressor[:, :joints].any(0), np.asarray(points.weights)),
+        movers=_movers(body.parents, np.any(regressor[:, :joints], axis=0), np.asarray(points.weights)),
         placed=tuple(names.index(place.name) for place in placed),
         groups=tuple((kinds.index(kind_of(each.name)), -1 if each.name.startswith("right_") else 1) for each in placed),
     )
 
 
-def _regressed(body, values):
+def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
     """Values of the joints from those of the vertices (n, ...)."""
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=skinning.EXACT)
 
 
-def _surface_points(body, vertices):
+def _surface_points(body: BodyModel, vertices: Int[np.ndarray, " p"]) -> SurfacePoints:
     """Vertices (p,) as they are."""
     return SurfacePoints(
         body.template[vertices],
@@ -226,7 +227,7 @@ def _surface_points(body, vertices):
     )
 
 
-def _joint_point(body, joint):
+def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
     """A joint as a point that it carries itself."""
     row = body.joint_regressor[joint : joint + 1]
     product = lambda values: jnp.einsum("jn,n...->j...", row, values, precision=skinning.EXACT)
@@ -238,7 +239,7 @@ def _joint_point(body, joint):
     )
 
 
-def _placed(body, finder, place):
+def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
     """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
     sources = finder.find(place.base)
     points = _concatenated(
@@ -252,7 +253,7 @@ def _placed(body, finder, place):
     return replace(mean, rest=mean.rest + jnp.asarray(place.offset, jnp.float32), weights=weights)
 
 
-def _concatenated(points):
+def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *points)
 
 
@@ -281,13 +282,19 @@ def landmarks_from(
     return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=skinning.EXACT)
 
 
-def _movers(parents, joints_used, point_weights):
+def _movers(
+    parents: tuple[int, ...], joints_used: Bool[np.ndarray, " j"], point_weights: Float[np.ndarray, "p j"]
+) -> tuple[int, ...]:
     """Joints above the used joints, and those that move a used point (p, j): turning a joint does not move itself."""
     moving = point_weights.max(axis=0, initial=0.0) > CARRIES
     for j in np.flatnonzero(joints_used | moving):
         while (j := parents[j]) >= 0:
             moving[j] = True
     return tuple(int(j) for j in np.flatnonzero(moving))
+
+
+Score = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
+"""What the best of some places has most of."""
 
 
 class _Finder:
@@ -310,7 +317,7 @@ class _Finder:
         except (KeyError, _NoVertex):
             return []
 
-    def _find(self, name):
+    def _find(self, name: str) -> list[int]:
         joint = lambda x: -1 - self.index[x]
         middles = {"neck": "shoulder", "mid_hip": "hip"}
         if name in middles:
@@ -342,43 +349,43 @@ class _Finder:
             return [self._finger_tip(f"{side}_{finger}")]
         return [joint(f"{side}_{finger}{int(knuckle)}")]
 
-    def _segment(self, *joints):
+    def _segment(self, *joints: str) -> Int[np.ndarray, " n"]:
         """Vertices that belong to some joints together; joints that the body lacks are left out."""
         owned = self.weights[:, [self.index[name] for name in joints if name in self.index]].sum(1)
         return np.flatnonzero(owned > MEMBER)
 
-    def _best(self, vertices, score):
+    def _best(self, vertices: Int[np.ndarray, " n"], score: Score) -> int:
         if not len(vertices):
             raise _NoVertex
         return int(vertices[np.argmax(score(self.template[vertices]))])
 
-    def _eyes(self):
+    def _eyes(self) -> Float[np.ndarray, "3"]:
         return self.joints[[self.index["left_eye"], self.index["right_eye"]]].mean(0)
 
-    def _nose(self):
+    def _nose(self) -> int:
         head = self._segment("head", "jaw")
         height, low, high = self.template[head, 1], self.joints[self.index["jaw"], 1], self._eyes()[1]
         return self._best(head[(height > low) & (height < high)], lambda p: p[:, 2])
 
-    def _on_midline(self, score, highest=np.inf):
+    def _on_midline(self, score: Score, highest: float = np.inf) -> int:
         """The best vertex of the front of the face's middle."""
         head = self._segment("head", "jaw")
         p = self.template[head]
         front = p[:, 2] > 0.5 * (self._eyes()[2] + p[:, 2].max()) - 0.02
         return self._best(head[front & (np.abs(p[:, 0]) < MIDLINE) & (p[:, 1] < highest)], score)
 
-    def _ear(self, sign):
+    def _ear(self, sign: float | int) -> int:
         head, eyes = self._segment("head", "jaw"), self._eyes()[1]
         height = self.template[head, 1]
         return self._best(head[(height > eyes - 0.06) & (height < eyes + 0.03)], lambda p: sign * p[:, 0])
 
-    def _foot(self, side, part):
+    def _foot(self, side: str, part: str) -> int:
         directions = {"foot_index": (0.0, 1.0), "big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
         outward, forward = directions[part]
         foot = self._segment(f"{side}_ankle", f"{side}_foot")
         return self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])
 
-    def _finger_tip(self, finger):
+    def _finger_tip(self, finger: str) -> int:
         along = self.joints[self.index[f"{finger}3"]] - self.joints[self.index[f"{finger}2"]]
         return self._best(self._segment(f"{finger}3"), lambda p: p @ along)
 

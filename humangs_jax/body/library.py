@@ -130,7 +130,7 @@ def read_body(path: str | Path) -> BodyModel:
         return _read_body(path)
 
 
-def _read_body(path):
+def _read_body(path: str | Path) -> BodyModel:
     arrays, pickled = read_npz(path)
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")

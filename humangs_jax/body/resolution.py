@@ -16,11 +16,13 @@ outside goes first.
 """
 
 import heapq
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.mesh import face_crosses, vertex_areas
@@ -81,14 +83,14 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     )
 
 
-def _edges(faces):
+def _edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
     """Undirected edges (e, 2), and which of them each side (corner i to i + 1) of each face is (f, 3)."""
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
     return edges, index.reshape(faces.shape)
 
 
-def _cut(faces, middles):
+def _cut(faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "finer 3"]:
     """Faces cut at the midpoints of their sides; middles (f, 3): the vertex on side i to i + 1, -1 for none."""
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
@@ -189,7 +191,7 @@ class _Mesh:
         self.blocked = {}
         self.stamp = [0] * len(self.positions)
 
-    def cost(self, u, v):
+    def cost(self, u: int, v: int) -> float:
         (x, y, z), (a, b, c) = self.positions[v], self.positions[u]
         xx, xy, xz, xd, yy, yz, yd, zz, zd, dd, area = self.quadrics[u]
         squared = x * x * xx + y * y * yy + z * z * zz + dd
@@ -197,18 +199,18 @@ class _Mesh:
         length = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
         return self.importance[u] * (length + FLATNESS * max(squared, 0.0) / max(area, 1e-12))
 
-    def between(self, u, v):
+    def between(self, u: int, v: int) -> list[int]:
         return [f for f in self.around[u] if v in self.faces[f]]
 
-    def uv_moves(self, u, shared, v):
+    def uv_moves(self, u: int, shared: list[int], v: int) -> dict[int, int] | None:
         """Texture vertex of u -> that of v in the same chart, or None if some chart at u does not reach v."""
         moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
         return moves if all(self.uv_at(f, u) in moves for f in self.around[u]) else None
 
-    def uv_at(self, face, vertex):
+    def uv_at(self, face: int, vertex: int) -> int:
         return self.uv_faces[face][self.faces[face].index(vertex)]
 
-    def allowed(self, u, v):
+    def allowed(self, u: int, v: int) -> bool:
         """Whether u -> v keeps the topology, the texture charts whole, and folds no face nor makes it a needle."""
         shared = self.between(u, v)
         common = self.beside[u] & self.beside[v]
@@ -235,9 +237,10 @@ class _Mesh:
                 return False
         return True
 
-    def collapse(self, u, v):
+    def collapse(self, u: int, v: int) -> None:
         shared = self.between(u, v)
         moves = self.uv_moves(u, shared, v)
+        assert moves is not None  # `allowed` asks
         for f in shared:
             for corner in self.faces[f]:
                 if corner != u:
@@ -257,22 +260,22 @@ class _Mesh:
         self.stamp[v] += 1
 
 
-def _normal(a, b, c):
+def _normal(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> tuple[float, float, float]:
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     return (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
 
 
-def _squared(x):
+def _squared(x: Sequence[float]) -> float:
     return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
 
 
-def _quality(normal, a, b, c):
+def _quality(normal: Sequence[float], a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
     edges = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
     return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(edges, 1e-30)
 
 
-def _vertex_quadrics(vertices, faces):
+def _vertex_quadrics(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 11"]:
     """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the area: (n, 11)."""
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -359,7 +362,9 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
     return moved
 
 
-def _carry_uvs(body, faces, target, kept_faces):
+def _carry_uvs(
+    body: BodyModel, faces: Int[np.ndarray, "f 3"], target: Int[np.ndarray, " n"], kept_faces: Bool[np.ndarray, " f"]
+) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
     """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest in the texture."""
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
     pairs = np.unique(faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel())  # (vertex, texture vertex)

@@ -75,7 +75,7 @@ def joint_transforms(
     return transform.make(world, offset)
 
 
-def _product(a, b):
+def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
     """Matrix product by multiplying and adding: exact on every backend.
 
     XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of this product.

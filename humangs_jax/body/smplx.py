@@ -50,7 +50,7 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
         return _load_smplx(path, shape_count, expression_count)
 
 
-def _load_smplx(path, shape_count, expression_count):
+def _load_smplx(path: str | Path, shape_count: int, expression_count: int) -> BodyModel:
     file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
     template = file.numbers("v_template", (None, 3), LARGEST)
     n = len(template)
@@ -76,7 +76,9 @@ def _load_smplx(path, shape_count, expression_count):
     )
 
 
-def _shape_directions(file: ArrayFile, n: int, shape_count: int, expression_count: int):
+def _shape_directions(
+    file: ArrayFile, n: int, shape_count: int, expression_count: int
+) -> tuple[Float[np.ndarray, "n 3 s"], tuple[str, ...]]:
     stored = file.numbers("shapedirs", (n, 3, None), LARGEST)
     columns = stored.shape[-1]
     if columns >= SHAPE_COLUMNS + EXPRESSION_COLUMNS:
@@ -122,7 +124,9 @@ def _part(name: str, values: Any, size: int, dtype: Any) -> Float[Array, " size"
     return values.reshape(size)
 
 
-def _hand(side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_hand_mean: bool, dtype: Any):
+def _hand(
+    side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_hand_mean: bool, dtype: Any
+) -> Float[Array, "45"]:
     """Axis-angle numbers (45,) of one hand."""
     name = ("left_hand_pose", "right_hand_pose")[side]
     if hands is None and not (flat_hand_mean and (values is None or not use_pca)):

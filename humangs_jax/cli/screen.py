@@ -113,7 +113,7 @@ def _show_warning(
 class _Handler(logging.Handler):
     """What libraries log, through the one door."""
 
-    def emit(self, record):
+    def emit(self, record: logging.LogRecord) -> None:
         try:
             say(self.format(record), error=True)
         except Exception:  # as all handlers do: a log must not end the work

@@ -17,7 +17,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of, signed_distance
 from humangs_jax.data.usable_views import MASK_THRESHOLD, joint_moves, joint_turns, unusable_views
@@ -99,10 +99,11 @@ def displacement(body: BodyModel, capture: Capture, inset: tuple[float, float] =
     return total.astype(np.float32)
 
 
-def _views(body, rest, capture):
+def _views(body: BodyModel, rest: Float[np.ndarray, "n 3"], capture: Capture) -> list[_View]:
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
     unusable = unusable_views(capture)
+    assert capture.masks is not None
     for i, frame in enumerate(np.asarray(capture.frames).tolist()):
         mask = np.asarray(capture.masks[i])
         if i in unusable:
@@ -123,7 +124,12 @@ def _views(body, rest, capture):
     return views
 
 
-def _window(mask, project, linear, offset):
+def _window(
+    mask: Float[np.ndarray, "h w"],
+    project: Float[np.ndarray, "3 4"],
+    linear: Float[np.ndarray, "n 3 3"],
+    offset: Float[np.ndarray, "n 3"],
+) -> _View:
     """A view, cut to the person and brought to one size. Beyond the border of the photo the mask goes on as it ends there."""
     (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
     margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))
@@ -140,7 +146,13 @@ def _window(mask, project, linear, offset):
     return _View(edges.astype(np.float32), to_window @ project, linear, offset, low + NEAR, high - NEAR)
 
 
-def _targets(views, rest, normals, faces, inset):
+def _targets(
+    views: list[_View],
+    rest: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    inset: tuple[float, float],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-INWARDS, OUTWARDS + STEP / 2, STEP)
@@ -161,7 +173,9 @@ def _targets(views, rest, normals, faces, inset):
     return count, summed
 
 
-def _crossing(depths, reach):
+def _crossing(
+    depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
+) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
     """Where the mask ends along each normal, nearest to its start: outwards from the inside, inwards from the outside."""
     zero = int(np.argmin(np.abs(reach)))
     distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
@@ -180,19 +194,27 @@ def _crossing(depths, reach):
     return distance, found
 
 
-def _silhouette(pixels, faces, shape):
+def _silhouette(
+    pixels: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"], shape: tuple[int, ...]
+) -> Float[np.ndarray, "h w"]:
     """1 where the body is, in a window."""
     triangles = pixels[faces]
     a, b, c = np.moveaxis(triangles, 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    image = Image.new("L", shape[::-1])
+    image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
     for corners in (triangles[turn < 0] - 0.5).reshape(-1, 6).tolist():  # the side that faces the camera covers all
         pen.polygon(corners, fill=1)
     return np.asarray(image, np.float32)
 
 
-def _spread(vertices, faces, count, summed, held):
+def _spread(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    count: Float[np.ndarray, " n"],
+    summed: Float[np.ndarray, " n"],
+    held: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
     """The smooth displacement that is nearest to the targets."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
@@ -201,7 +223,9 @@ def _spread(vertices, faces, count, summed, held):
     return np.clip(splu(matrix.tocsc()).solve(areas * summed), -INWARDS, OUTWARDS)
 
 
-def _laplacian(vertices, faces):
+def _laplacian(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> sparse.csr_array | sparse.csr_matrix:
     """By the cotangents of the angles, none of them negative."""
     rows, columns, values = [], [], []
     for i in range(3):
@@ -216,7 +240,14 @@ def _laplacian(vertices, faces):
     return (sparse.diags(np.asarray(weights.sum(axis=1))) - weights).tocsr()
 
 
-def _outside(views, rest, normals, faces, inset, free):
+def _outside(
+    views: list[_View],
+    rest: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    inset: tuple[float, float],
+    free: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
     """How far each vertex moves inwards until all masks contain it, smoothly."""
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)
@@ -236,12 +267,12 @@ def _outside(views, rest, normals, faces, inset, free):
     return move
 
 
-def _at(image, pixels):
+def _at(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
     """Bilinear; pixel centres at + 0.5."""
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
     return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)
 
 
-def _normals(vertices, faces):
+def _normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
     across = np.repeat(face_crosses(vertices, faces), 3, axis=0)
     return unit(np.stack([np.bincount(faces.ravel(), across[:, i], len(vertices)) for i in range(3)], axis=-1))

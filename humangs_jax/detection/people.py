@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.detection.blazepose import (
     LANDMARK_SIZE,
     Crop,
@@ -88,7 +88,7 @@ def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list
     ]
 
 
-def _people(networks, photo, detections):
+def _people(networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: list[Detection]) -> list[Landmarks]:
     """The landmarks of those detections that are people, the largest first."""
     height, width = photo.shape[:2]
     found = []
@@ -105,7 +105,7 @@ def _people(networks, photo, detections):
     return sorted(kept, key=lambda person: -person.crop.side)
 
 
-def _settled(networks, photo, crop):
+def _settled(networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop) -> tuple[Landmarks, float]:
     """Landmarks of a crop that they confirm, and how far they would still move it, a share of its side.
 
     The landmark network knows hips and size better than the detector. It looks at least twice.
@@ -154,7 +154,7 @@ def distinct(detections: list[Detection], longest: int) -> list[Detection]:
     return kept
 
 
-def _same_detection(a, b):
+def _same_detection(a: Detection, b: Detection) -> bool:
     sides = sorted((a.crop().side, b.crop().side))
     return float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1] and sides[1] < SAME_SIZE * sides[0]
 
@@ -172,8 +172,8 @@ def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> flo
     return float(np.mean(mask_at(other, own) > SEEN)) if len(own) else 0.0
 
 
-def _inside(pixels, width, height):
-    return ((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5)).all(-1)
+def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+    return np.all((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5), axis=-1)
 
 
 LEVEL = 0.4
@@ -208,7 +208,9 @@ def sharpened(
     return result
 
 
-def _affine(guide, mask, radius):
+def _affine(
+    guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over the windows of each pixel."""
     side = 2 * radius + 1
     mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")

@@ -51,6 +51,10 @@ PARTS = ("nose", "eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ank
 """Landmarks that err independently: those of a face or a hand err together."""
 
 
+Bundle = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m k 3"], Float[np.ndarray, "m c k"], float]
+"""Rotations of the cameras, points, weights of what is no outlier, noise in pixels."""
+
+
 @dataclasses.dataclass(frozen=True)
 class CameraError:
     """A camera that is turned or late. views: indices of its views. names: of its first view, and of other cameras that would
@@ -84,7 +88,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     return (*late, *_turned_cameras(photos, keypoints))
 
 
-def _turned_cameras(photos, keypoints):
+def _turned_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
     seen = _Seen.of(photos, keypoints)
     if seen is None:
         return ()
@@ -133,7 +137,7 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
 # Time ----------------------------------------------------------------------------------------------------------------
 
 
-def _late_cameras(photos, keypoints):
+def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple[CameraError, ...], Keypoints]:
     """The cameras that are late, and the keypoints as if they were not; what then has no photo has no certainty."""
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames, True).camera)
     count, frames, found = int(camera_of.max()) + 1, photos.frame_count, {}
@@ -197,7 +201,7 @@ class _Seen:
     count: int
 
     @classmethod
-    def of(cls, photos, keypoints, edge=0):
+    def of(cls, photos: Photos | Capture, keypoints: Keypoints, edge: int = 0) -> "_Seen | None":
         """None if there is too little to say anything. edge: moments at either end that are left out."""
         kinds = [name.removeprefix("left_").removeprefix("right_") in PARTS for name in keypoints.set.names]
         observations, views = group_by_frame(photos, keypoints)
@@ -216,7 +220,7 @@ class _Seen:
             points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], camera_of, count
         )
 
-    def equations(self):
+    def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
         """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and Hessians (k, 3 n, 3 n), in
         standard deviations, landmark by landmark; the points are eliminated. Outliers are found with all cameras free.
         """
@@ -225,7 +229,7 @@ class _Seen:
             gradients, matrices, _, points = self._linear(np.zeros_like(turned), points, weights)
         return gradients, matrices
 
-    def bundle(self):
+    def bundle(self) -> Bundle:
         """Rotations (n, 3) and points (m, k, 3) that fit best, weights (m, c, k) of what is no outlier, noise in pixels."""
         turned, points, weights, noise = np.zeros((self.count, 3)), self._middle(), self.weights, 1.0
         for _ in range(ITERATIONS):
@@ -237,7 +241,7 @@ class _Seen:
             weights = self.weights * np.square(scale / (scale + lengths**2)) / noise**2
         return turned, points, weights, noise
 
-    def costs(self, state, units=None):
+    def costs(self, state: Bundle, units: Bundle | None = None) -> Float[np.ndarray, " k"]:
         """(k,) means of the robust costs of the landmarks of a bundle, in units of its noise, or of another one's."""
         noise = (units or state)[3]
         lengths = np.linalg.norm(self._errors(*state[:2]), axis=-1) / noise
@@ -245,7 +249,7 @@ class _Seen:
         costs = (self.weights * lengths**2 / (1 + (lengths / ROBUST_SCALE) ** 2)).sum((0, 1))
         return costs / np.where(total > 0, total, np.inf)
 
-    def without(self, camera, state):
+    def without(self, camera: int, state: Bundle) -> Bundle:
         """The bundle with the points that all cameras but one see."""
         turned, points, weights, noise = state
         weights = np.where((self.camera == camera)[..., None], 0.0, weights)
@@ -253,12 +257,12 @@ class _Seen:
             points = self._linear(turned, points, weights)[-1]
         return turned, points, weights, noise
 
-    def misses(self, camera, state):
+    def misses(self, camera: int, state: Bundle) -> float:
         """Median distance of a camera's landmarks from the points of a bundle, pixels."""
         lengths = np.linalg.norm(self._errors(*state[:2]), axis=-1)
         return float(np.median(lengths[(self.weights > 0) & (self.camera == camera)[..., None]]))
 
-    def _middle(self):
+    def _middle(self) -> Float[np.ndarray, "m k 3"]:
         """(m, k, 3) the point nearest to the axes of all cameras, to begin with."""
         axes = self.matrices[..., 2, :3]
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
@@ -266,7 +270,7 @@ class _Seen:
         total, right = across.sum((0, 1)), np.einsum("mcab,mcb->a", across, centers)
         return np.broadcast_to(np.linalg.solve(total + 1e-6 * np.eye(3), right), (len(axes), self.points.shape[2], 3))
 
-    def _project(self, turned, points):
+    def _project(self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]) -> tuple[np.ndarray, ...]:
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
         shift = np.einsum("mcab,mcb->mca", turn, self.matrices[..., :3, 3])
@@ -275,11 +279,17 @@ class _Seen:
         focal = np.stack([self.K[..., 0, 0], self.K[..., 1, 1]], axis=-1)[:, :, None]
         return rotation, local, depth, local[..., :2] / depth[..., None], focal
 
-    def _errors(self, turned, points):
+    def _errors(
+        self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
+    ) -> Float[np.ndarray, "m c k 2"]:
         _, _, _, slope, focal = self._project(turned, points)
         return slope * focal + self.K[:, :, None, :2, 2] - self.points
 
-    def _linear(self, turned, points, weights):
+    def _linear(
+        self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"], weights: Float[np.ndarray, "m c k"]
+    ) -> tuple[
+        Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"], Float[np.ndarray, "m c k 2"], Float[np.ndarray, "m k 3"]
+    ]:
         """Gradients and Hessians at rotations, the residuals, and the points after one more step of Gauss and Newton."""
         rotation, local, depth, slope, focal = self._project(turned, points)
         errors = slope * focal + self.K[:, :, None, :2, 2] - self.points
@@ -304,7 +314,7 @@ class _Seen:
         return gradients.transpose(1, 0, 2).reshape(k, 3 * n), flat, errors, points - step
 
 
-def _cross(vectors):
+def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """(..., 3, 3) matrices of the cross product with vectors."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
@@ -312,7 +322,7 @@ def _cross(vectors):
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _solve(gradient, matrix):
+def _solve(gradient: Float[np.ndarray, " u"], matrix: Float[np.ndarray, "u u"]) -> Float[np.ndarray, " u"]:
     return np.linalg.solve(matrix + np.eye(len(matrix)) / PRIOR**2, gradient)
 
 
@@ -325,7 +335,7 @@ class _Solved:
     clear: float
 
 
-def _solved(gradients, matrices, cameras) -> _Solved:
+def _solved(gradients: Float[np.ndarray, "k u"], matrices: Float[np.ndarray, "k u u"], cameras: list[int]) -> _Solved:
     """The rotations of some cameras while the others stay."""
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
     own, curved = gradients[:, at], matrices[:, at[:, None], at]

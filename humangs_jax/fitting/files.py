@@ -17,6 +17,7 @@ import dataclasses
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -88,7 +89,7 @@ def read_fit_record(path: str | Path) -> FitRecord:
         return _read_fit_record(path)
 
 
-def _read_fit_record(path):
+def _read_fit_record(path: Path) -> FitRecord:
     values, pickled = read_npz(path)
     if pickled:
         raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
@@ -139,7 +140,7 @@ def check_place(
     return target
 
 
-def _photo_files(folder, description):
+def _photo_files(folder: Path, description: dict[str, Any]) -> list[Path]:
     """Images and masks of a capture."""
     return [folder / view[key] for view in description["views"] for key in ("image", "mask") if key in view]
 
@@ -180,7 +181,7 @@ def write_fitted(
         replace_folder(target, write, mark="capture.json")
 
 
-def _with_cameras(description, capture):
+def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, Any]:
     """capture.json with the cameras of the capture where they have changed."""
     views = []
     for i, view in enumerate(description["views"]):
@@ -190,7 +191,7 @@ def _with_cameras(description, capture):
     return description | {"views": views}
 
 
-def _copy(source, folder, file):
+def _copy(source: Path, folder: Path, file: str) -> None:
     target = folder / file
     if not target.resolve().is_relative_to(folder.resolve()):
         raise CaptureError(source / "capture.json", file, "lies outside of the capture folder: fit it in place")

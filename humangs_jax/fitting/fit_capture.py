@@ -2,14 +2,15 @@
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model, pose_landmarks
-from humangs_jax.body.model import BodyModel, without_expression
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.body.model import BodyModel, BodyPose, without_expression
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -38,6 +39,7 @@ from humangs_jax.fitting.report import (
 )
 from humangs_jax.fitting.residuals.keypoints import (
     PLACE_STD,
+    KeypointProblem,
     Observations,
     found_noise,
     frame_residuals,
@@ -100,7 +102,7 @@ def fit_uncertainty(model: LandmarkModel, observations: Observations, fit: Landm
     return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape_covariance)
 
 
-def _determined(problem, poses):
+def _determined(problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]) -> Float[np.ndarray, "m j"]:
     """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
     left = variances[:, 6:].reshape(len(poses), len(joints), 3)
@@ -112,7 +114,9 @@ def _determined(problem, poses):
 
 
 @jax.jit
-def _derivatives(model, observations, fit):
+def _derivatives(
+    model: LandmarkModel, observations: Observations, fit: LandmarkFit
+) -> tuple[Float[Array, "m r p"], Float[Array, "m r s"], Float[Array, "m j 3 p"], Float[Array, "m j 3 s"]]:
     """Derivatives of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
     problem = keypoint_problem(model)
 
@@ -242,13 +246,15 @@ def examine_record(
 
 
 @jax.jit
-def _errors(model, betas, poses, observations):
+def _errors(
+    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, observations: Observations
+) -> Float[Array, "m c k 2"]:
     """(m, c, k, 2) landmarks less keypoints, pixels."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(keypoint_errors)(observations, landmarks)
 
 
-def _worst_frame(frames):
+def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
     known = np.flatnonzero(np.isfinite(frames))
     if len(frames) < 2 or not len(known):
         return ()
@@ -257,13 +263,15 @@ def _worst_frame(frames):
     return (f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",)
 
 
-def _view_report(name, frame, lengths, outliers):
+def _view_report(
+    name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]
+) -> ViewReport:
     count = int(np.isfinite(lengths).sum())
     share = float(outliers.sum() / max(count, 1))
     return ViewReport(name, frame, count, _quantile(lengths, 0.5), _quantile(lengths, 0.9), share)
 
 
-def _quantile(values, share):
+def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
     """A quantile of the values that are not NaN; NaN if all are."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
@@ -301,7 +309,11 @@ class FittedCapture:
         smooth = "motion" in fit.outcomes
         names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
         stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
-        warnings = (*report.warnings, *_blind_frames(seen, smooth), *_motion_warnings(fit, self.config.smoothness))
+        warnings = (
+            *report.warnings,
+            *_blind_frames(seen, smooth),
+            *_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), self.config.smoothness),
+        )
         turned = (f"{error}: turned back" for error in self.camera_errors)
         notes = (*report.notes, *_places(self.model, fit), *turned)
         return dataclasses.replace(report, stages=stages, notes=notes, warnings=warnings)
@@ -349,7 +361,7 @@ def fit_photos(
     return FittedCapture(capture, record, fit, model, observations, config, errors)
 
 
-def _places(model, fit):
+def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
     """A line about landmarks that the detector sees elsewhere, if the fit looked for them."""
     if fit.state.places is None:
         return
@@ -360,7 +372,7 @@ def _places(model, fit):
         yield f"the detector sees landmarks beside where the body has them, which is undone: {', '.join(far)}"
 
 
-def _blind_frames(seen, smooth):
+def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str]:
     """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the motion is."""
     taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     for frame, views in enumerate(seen):
@@ -371,14 +383,13 @@ def _blind_frames(seen, smooth):
             yield f"frame {frame}: seen by one view: distance and height are hardly determined"
 
 
-def _motion_warnings(fit, smoothness):
-    """Warnings about motion that was to be smooth."""
+def _motion_warnings(joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float) -> Iterator[str]:
+    """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were held."""
     if not smoothness:
         return
-    if len(fit.noise) < 3:
-        yield f"smoothness: {len(fit.noise)} frames have no acceleration: it changes nothing"
+    if len(joints) < 3:
+        yield f"smoothness: {len(joints)} frames have no acceleration: it changes nothing"
         return
-    held, joints = float(fit.smoothness), np.asarray(fit.joints, float)
     if not held:
         yield "smoothness: the keypoints contradict a smooth motion: frames are fitted one by one"
     elif held > 1.5 * smoothness:

@@ -115,7 +115,7 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitC
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _fit_frames(model, observations, config):
+def _fit_frames(model: LandmarkModel, observations: Observations, config: FitConfig) -> LandmarkFit:
     """All stages but the motion."""
     problem = keypoint_problem(model)
     states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
@@ -131,14 +131,20 @@ def _fit_frames(model, observations, config):
     return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
 
 
-def _result(problem, noise, state, outcomes, smoothness):
+def _result(
+    problem: KeypointProblem,
+    noise: Float[Array, " m"],
+    state: FitState,
+    outcomes: dict[str, Outcome],
+    smoothness: Float[Array, ""],
+) -> LandmarkFit:
     betas = betas_of(problem.origin, state)
     poses = _poses(problem, state)
     landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(poses)
     return LandmarkFit(betas, poses, landmarks, joints, noise, state, outcomes, smoothness, problem.model.certainty)
 
 
-def _poses(problem, state):
+def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
     """The poses of a state of m frames, a batch."""
     return jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
 
@@ -150,7 +156,7 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
     return KeypointProblem(model, prior, origin)
 
 
-def _fit_frame(problem, seen, config):
+def _fit_frame(problem: KeypointProblem, seen: Observations, config: FitConfig) -> tuple[FitState, dict[str, Outcome]]:
     """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
     several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
@@ -169,7 +175,13 @@ COARSE = 30.0
 """Robust scale of keypoints while the body rests, standard deviations."""
 
 
-def _rigid_starts(problem, observations, points, counts, kept) -> FitState:
+def _rigid_starts(
+    problem: KeypointProblem,
+    observations: Observations,
+    points: Float[Array, "k 3"],
+    counts: Float[Array, " k"],
+    kept: int,
+) -> FitState:
     """The `kept` best positions and orientations of a resting body, a batch.
 
     The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24 orientations of a cube compete with it.
@@ -209,7 +221,9 @@ def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     return np.stack([m for m in signed if np.linalg.det(m) > 0])
 
 
-def _kabsch(a, b, weights):
+def _kabsch(
+    a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
+) -> Float[Array, "3 3"]:
     """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
@@ -220,7 +234,9 @@ def _kabsch(a, b, weights):
     return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
 
 
-def _position(observations, offsets, weights):
+def _position(
+    observations: Observations, offsets: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
+) -> Float[Array, "3"]:
     """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a detection over the focal
     length, x (z + t_z) = X + t_x and likewise y, linear in t.
     """
@@ -236,7 +252,9 @@ def _position(observations, offsets, weights):
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
-def _metres_per_pixel(seen, points, weights):
+def _metres_per_pixel(
+    seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]
+) -> Float[Array, ""]:
     """Metres per pixel at the person's distance."""
     centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
@@ -261,7 +279,7 @@ BODY = (*BODY_NAMES, "jaw")
 """Joints that move before the hands do."""
 
 
-def _stages(problem, targets):
+def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     """A batch of the four stages."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
@@ -286,7 +304,9 @@ def _stages(problem, targets):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
 
-def _run_stages(problem, seen, start, stages, config):
+def _run_stages(
+    problem: KeypointProblem, seen: Observations, start: FitState, stages: _Stage, config: FitConfig
+) -> tuple[FitState, Outcome]:
     """All stages, each from the end of the one before. Returns the state and outcomes of each."""
 
     def run(state, stage):
@@ -297,7 +317,7 @@ def _run_stages(problem, seen, start, stages, config):
     return jax.lax.scan(run, start, stages)
 
 
-def _noise_found(problem, observations, states):
+def _noise_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " m"]:
     """(m,) std of the detections after the first stages, pixels."""
 
     def of_frame(seen, state):
@@ -307,7 +327,7 @@ def _noise_found(problem, observations, states):
     return jax.vmap(of_frame)(observations, states)
 
 
-def _certainty_found(problem, observations, states):
+def _certainty_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " k"]:
     """(k,) of landmarks, from the errors of the first stages in the frames that several views show: a robust noise of each pair,
     over that of all. The fewer there are, the nearer to the usual.
     """
@@ -328,7 +348,9 @@ def _certainty_found(problem, observations, states):
     return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
 
 
-def _person_residuals(problem, observations, state):
+def _person_residuals(
+    problem: KeypointProblem, observations: Observations, state: FitState
+) -> dict[str, Float[Array, "..."]]:
     """All frames at once with one shape."""
     of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
@@ -398,7 +420,7 @@ def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) ->
     return joints[2:] - 2 * joints[1:-1] + joints[:-2]
 
 
-def _bridged(problem, seen, state):
+def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
     """The state with the poses of frames that show nothing interpolated between their nearest neighbours that show something."""
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW

@@ -9,6 +9,7 @@ On the host in float64: a hundred unknowns, and every number of photos would be 
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -81,7 +82,9 @@ def align_views(
     return shape, rotations
 
 
-def _turn(source, target, weights):
+def _turn(
+    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "3 3"]:
     try:
         return align_points(source, target, weights).rotation
     except ValueError:  # the points of a view lie on a line: any turn about it
@@ -130,13 +133,13 @@ def adjust(evidence: Evidence, start: Rig) -> tuple[Rig, float]:
     return Rig(*(getattr(moved, field.name)[0] for field in dataclasses.fields(Rig))), cost
 
 
-def _jacobian(residuals, y):
+def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], y: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
     """By forward differences, all at once."""
     found = residuals(np.concatenate([y[None], y + DIFFERENCE * np.eye(len(y))]))
     return (found[1:] - found[0]).T / DIFFERENCE
 
 
-def _moved(evidence, start, y) -> Rig:
+def _moved(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"]) -> Rig:
     """Rigs of unknowns (n, 3 k + 6 c + 1): changes of landmarks, turns, places, and one of all focal lengths."""
     c, k = evidence.weights.shape
     landmarks, turns, change, focal = np.split(y, np.cumsum([3 * k, 3 * c, 3 * c]), axis=1)
@@ -157,17 +160,17 @@ def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "*n c k 2"]:
     return _pixel_errors(evidence, rig, _turned(rig))
 
 
-def _pixel_errors(evidence, rig, turned):
+def _pixel_errors(evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "*n c k 3"]) -> Float[np.ndarray, "*n c k 2"]:
     seen = turned + rig.places[..., None, :]
     return seen[..., :2] / np.maximum(seen[..., 2:], NEAR) * rig.focal[..., None, None] - evidence.points
 
 
-def _turned(rig):
+def _turned(rig: Rig) -> Float[np.ndarray, "*n c k 3"]:
     """Landmarks in the axes of every camera."""
     return rig.landmarks[..., None, :, :] @ np.swapaxes(rig.rotations, -1, -2)
 
 
-def _residuals(evidence, start, y, scale):
+def _residuals(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"], scale: float) -> Float[np.ndarray, "n r"]:
     """(n, r) for unknowns (n, u), in standard deviations."""
     rig = _moved(evidence, start, y)
     turned, root = _turned(rig), np.sqrt(evidence.weights)[..., None]

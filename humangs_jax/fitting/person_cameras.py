@@ -9,13 +9,13 @@ trial. That all are mirrored is told by the body, whose toes and nose are in fro
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import shape_body
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import mirrored_name
@@ -167,19 +167,19 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
     )
 
 
-def _quick_error(seen):
+def _quick_error(seen: PersonViews) -> float:
     """The error of photos as one moment, without a look for mirrored views."""
     return _try(_cleaned(seen), _mirror(seen), np.zeros(len(seen.points), bool)).error
 
 
-def _mirror(seen):
+def _mirror(seen: PersonViews) -> Int[np.ndarray, " k"]:
     return np.asarray([seen.names.index(mirrored_name(name)) for name in seen.names])
 
 
 # What is given -------------------------------------------------------------------------------------------------------
 
 
-def _check(seen, height):
+def _check(seen: PersonViews, height: float | None) -> None:
     views = len(seen.points)
     if not views:
         raise ValueError("no photo of the person: expected one or more")
@@ -198,12 +198,12 @@ def _check(seen, height):
             raise ValueError(f"{photo}: focal length {focal:g}: expected pixels, or NaN where it is unknown")
 
 
-def _known(seen):
+def _known(seen: PersonViews) -> Bool[np.ndarray, "c k"]:
     finite = np.isfinite(seen.points).all(-1) & np.isfinite(seen.world).all(-1)
     return finite & (np.nan_to_num(seen.visibility) > SEEN)
 
 
-def _cleaned(seen):
+def _cleaned(seen: PersonViews) -> PersonViews:
     known = _known(seen)
     return dataclasses.replace(
         seen,
@@ -213,7 +213,7 @@ def _cleaned(seen):
     )
 
 
-def _focal_lengths(seen):
+def _focal_lengths(seen: PersonViews) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Focal lengths (c,) and stds of their logarithms; those of photos without are like the others', or the usual."""
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
@@ -222,11 +222,13 @@ def _focal_lengths(seen):
     return np.where(known, seen.focal, usual * diagonals), std
 
 
-def _centered(values, weights):
+def _centered(values: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
     return values - (weights[:, None] * values).sum(0) / weights.sum()
 
 
-def _evidence(seen, mirror, mirrored) -> tuple[Evidence, Rig]:
+def _evidence(
+    seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]
+) -> tuple[Evidence, Rig]:
     """Evidence with left and right of some views exchanged, and cameras to start from."""
     focal, std = _focal_lengths(seen)
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
@@ -252,17 +254,17 @@ def _evidence(seen, mirror, mirrored) -> tuple[Evidence, Rig]:
     return evidence, Rig(shape, rotations, places, focal)
 
 
-def _ray(points, weights, focal):
+def _ray(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"], focal: float) -> Float[np.ndarray, "3"]:
     """The unit direction in which a camera sees the person."""
     direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
     return direction / np.linalg.norm(direction)
 
 
-def _person_size(points, weights):
+def _person_size(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"]) -> float:
     return float(np.ptp(np.quantile(points[weights > 0], OUTER, axis=0), axis=0).max())
 
 
-def _bones(names):
+def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
     rows = []
     for a, b in BONES:
         ends = [[f"{side}_{a}", f"{side}_{b}"] for side in ("left", "right")]
@@ -274,7 +276,7 @@ def _bones(names):
 # Cameras -------------------------------------------------------------------------------------------------------------
 
 
-def _with_mirrored(seen, mirror) -> "_Trial":
+def _with_mirrored(seen: PersonViews, mirror: Int[np.ndarray, " k"]) -> "_Trial":
     """The cameras with the sides of mirrored views changed back."""
     views = len(seen.points)
     found = _try(seen, mirror, np.zeros(views, bool))
@@ -306,7 +308,7 @@ class _Trial:
         return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
 
 
-def _least(seen, mirror, start: _Trial) -> _Trial:
+def _least(seen: PersonViews, mirror: Int[np.ndarray, " k"], start: _Trial) -> _Trial:
     """View after view is mirrored while that explains the landmarks clearly better."""
     while True:
         trials = [
@@ -318,13 +320,13 @@ def _least(seen, mirror, start: _Trial) -> _Trial:
         start = best
 
 
-def _try(seen, mirror, mirrored) -> _Trial:
+def _try(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> _Trial:
     """Bundle adjustment with these views (c,) mirrored."""
     evidence, start = _evidence(seen, mirror, mirrored)
     return _Trial(mirrored, *adjust(evidence, start), evidence)
 
 
-def _relative_error(errors, weights):
+def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
     """Rms of errors (c, k), by degrees of freedom where there are any: points and cameras were fitted to them."""
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()
@@ -333,21 +335,21 @@ def _relative_error(errors, weights):
     return float(np.sqrt(np.sum((weights > SEEN) * np.minimum(errors, 0.2) ** 2) / left))
 
 
-def _around(rig):
+def _around(rig: Rig) -> bool:
     """Whether photos see the person from several directions: else the landmarks of one decide nothing about the others."""
     places = rig.places
     towards = -np.einsum("cba,cb->ca", rig.rotations, places / np.linalg.norm(places, axis=1, keepdims=True))
-    return len(places) == 1 or np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max() > LEAST_ANGLE
+    return len(places) == 1 or bool(np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max() > LEAST_ANGLE)
 
 
 # The world -----------------------------------------------------------------------------------------------------------
 
 
-def _middle(points, names, part):
+def _middle(points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str) -> Float[np.ndarray, "3"]:
     return np.mean([points[names.index(f"{side}_{part}")] for side in ("left", "right")], axis=0)
 
 
-def _front(points, names):
+def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
     """The direction (3,) of toes and nose, from heels and ears."""
     ends = (("left_foot_index", "left_heel"), ("right_foot_index", "right_heel"), ("left_big_toe", "left_heel"))
     ends = (*ends, ("right_big_toe", "right_heel"))
@@ -357,19 +359,19 @@ def _front(points, names):
     return np.sum(found, axis=0) if found else np.zeros(3)
 
 
-def _across(points, names):
+def _across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
     """The direction (3,) of the left side."""
     side = lambda part: points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
     return side("shoulder") + side("hip")
 
 
-def _handedness(points, names):
+def _handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:
     """Positive if the left side is to the left of somebody who looks to the front."""
     up = _middle(points, names, "shoulder") - _middle(points, names, "hip")
     return float(np.linalg.det(np.stack([_across(points, names), up, _front(points, names)])))
 
 
-def _in_world(seen, rig, height):
+def _in_world(seen: PersonViews, rig: Rig, height: float | None) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this height."""
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     names = seen.names
@@ -404,7 +406,7 @@ def _in_world(seen, rig, height):
     return tuple(cameras), turned - origin
 
 
-def _warnings(seen, mirrored, height):
+def _warnings(seen: PersonViews, mirrored: Bool[np.ndarray, " c"], height: float | None) -> Iterator[str]:
     if height is None:
         yield "the person's height is not given: lengths are a detector's guess, often 6 to 11 % too small"
     if not np.isfinite(seen.focal).any():

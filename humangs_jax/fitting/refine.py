@@ -7,6 +7,7 @@ least squares. `StateStd` is a Gaussian prior around the start: without it camer
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body, without_expression
 from humangs_jax.body.skinning import EXACT, SurfacePoints, pose_points
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -31,6 +32,7 @@ from humangs_jax.fitting.residuals.keypoints import (
 )
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
+    Boundary,
     MaskView,
     Matches,
     body_boundary,
@@ -164,7 +166,9 @@ def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
 
 
 @jax.jit
-def _moved(origin, state):
+def _moved(
+    origin: Origin, state: FitState
+) -> tuple[tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]], Float[Array, " s"], BodyPose]:
     return cameras_of(origin, state), betas_of(origin, state), pose_of(origin, state)
 
 
@@ -345,13 +349,19 @@ def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPo
 
 
 @jax.jit
-def _keypoint_errors(model, betas, poses, seen, frames):
+def _keypoint_errors(
+    model: LandmarkModel,
+    betas: Float[Array, " s"],
+    poses: BodyPose,
+    seen: Observations,
+    frames: Int[np.ndarray | Array, " v"],
+) -> Float[Array, "v c k"]:
     """(v, 1, k) pixels."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(reprojection_errors)(seen, landmarks[frames])
 
 
-def _noise(boundaries, matches):
+def _noise(boundaries: Sequence[Boundary], matches: Sequence[Matches]) -> float:
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
     off = [
         np.asarray(distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
@@ -362,7 +372,9 @@ def _noise(boundaries, matches):
     return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0
 
 
-def _person_height(masks, observations):
+def _person_height(
+    masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"], observations: Observations | None
+) -> float:
     """Height of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
@@ -371,7 +383,7 @@ def _person_height(masks, observations):
     return float(np.median(sizes)) if sizes else float("nan")
 
 
-def _observations(cameras, keypoints, scale):
+def _observations(cameras: Camera, keypoints: Keypoints, scale: float) -> Observations:
     """Keypoints of images of another scale: a batch of views, each with one view (c = 1)."""
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
     arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
@@ -428,7 +440,7 @@ def refine_capture(
     return RefinedCapture(best, _report(capture, best, before, score, tuple(stages), notes))
 
 
-def _check(capture, keypoints):
+def _check(capture: Capture, keypoints: Keypoints | None) -> None:
     """Whether there is anything to refine by."""
     masks = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
     if keypoints is not None and len(keypoints.points) != capture.view_count:
@@ -440,14 +452,16 @@ def _check(capture, keypoints):
         )
 
 
-def _better(found, before, most_worse):
+def _better(found: Score, before: Score, most_worse: float) -> bool:
     known = found.keypoints is not None and before.keypoints is not None
     least = LEAST_GAIN if known else LEAST_GAIN_OF_MASKS
     worse = known and found.keypoints > most_worse * before.keypoints
     return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
 
 
-def _report(start, best, before, after, stages, notes):
+def _report(
+    start: Capture, best: Capture, before: Score, after: Score, stages: tuple[Stage, ...], notes: Sequence[str]
+) -> FitReport:
     kept = best is not start
     pairs = {
         "silhouette_iou": (before.iou, after.iou),

@@ -132,7 +132,7 @@ class FitReport:
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(own) for key, own in value.items()}
     if isinstance(value, list | tuple):
@@ -269,11 +269,11 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _names(views):
+def _names(views: Sequence[ViewReport]) -> str:
     return f"view {listed([view.name for view in views])}"
 
 
-def _span(views, field, form):
+def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
     """The least and the greatest value of a field, or the one value if they are equal."""
     ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)

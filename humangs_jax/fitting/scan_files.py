@@ -9,7 +9,7 @@ joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import floats
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -44,6 +44,10 @@ OCCLUDERS = 5
 """Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5 cm wide."""
 LEAST_FACES = 50
 """A surface of a person has at least this many."""
+
+
+View = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
+"""An image and its mask."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -188,7 +192,7 @@ def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
         return {name: np.asarray(point, np.float64) for name, point in joints.items()}
 
 
-def _joints_of_npz(path):
+def _joints_of_npz(path: Path) -> dict[str, np.ndarray]:
     arrays, _ = read_npz(path)
     if missing := {"names", "points"} - set(arrays):
         raise ValueError(f"{min(missing)}: missing: expected names (k,) and points (k, 3)")
@@ -267,7 +271,7 @@ def read_placement(file):
         return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
-def _into_world(vertices, up):
+def _into_world(vertices: Float[np.ndarray, "n 3"], up: str | None) -> Similarity:
     """The similarity that stands a scan upright around the origin."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if up is not None and up not in AXES:
@@ -280,7 +284,13 @@ def _into_world(vertices, up):
     return Similarity(scale, rotation, -scale * rotation @ (low + high) / 2)
 
 
-def _draw(vertices, faces, colors, cameras: Camera, views):
+def _draw(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colors: Float[np.ndarray, "n 3"],
+    cameras: Camera,
+    views: int,
+) -> Iterator[View]:
     """Images (h, w, 3) on white, shaded by a light at the camera, and masks (h, w)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
@@ -298,7 +308,7 @@ def _draw(vertices, faces, colors, cameras: Camera, views):
         yield painted * shade[..., None], (face >= 0).astype(np.float32)
 
 
-def _write(folder, drawn, cameras, align):
+def _write(folder: Path, drawn: Iterable[View], cameras: Camera, align: Similarity) -> None:
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     listed = []

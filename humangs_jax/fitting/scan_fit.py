@@ -9,6 +9,7 @@ scan's axis nearest to the person's is used if one is near (`UPRIGHT`), otherwis
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -34,6 +35,7 @@ from humangs_jax.fitting.scan_search import (
     start_state,
 )
 from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.solve import Outcome
 from humangs_jax.fitting.state import scale_of
 from humangs_jax.geometry import quaternion
 
@@ -135,7 +137,9 @@ def fit_scan(
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
 
 
-def _given(align, points, known, height):
+def _given(
+    align: Similarity, points: Float[np.ndarray, "k 3"], known: Float[np.ndarray, " k"], height: float | int | None
+) -> Given:
     number = lambda x: jnp.asarray(x, jnp.float32)
     return Given(
         points=number(np.where(known[:, None] > 0, align(points), 0.0)),
@@ -146,7 +150,15 @@ def _given(align, points, known, height):
     )
 
 
-def _report(scan, from_joints, scale, up, distances, covered, outcomes):
+def _report(
+    scan: Scan,
+    from_joints: bool,
+    scale: float,
+    up: str,
+    distances: Float[np.ndarray, " r"],
+    covered: float,
+    outcomes: Sequence[Outcome],
+) -> FitReport:
     errors = {"scan_near_body": Change(covered)}
     if len(distances):
         low, middle, high = 1000 * np.quantile(distances, (0.05, 0.5, 0.95))
@@ -198,7 +210,7 @@ def place_upright(
     return BodyPose(rotations, number(center + move - pelvis)), world_from_frame.after(frame_from_scan), up
 
 
-def _up_axis(own, rotation):
+def _up_axis(own: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3"], str]:
     """Up in the frame, and its name: an axis of the scan near to the person's own axis, or that."""
     along = own @ rotation
     best = int(np.abs(along).argmax())

@@ -10,7 +10,7 @@ A round pairs scan and body as they are, then takes a few steps of damped least 
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -121,7 +121,9 @@ def leftover(problem: ScanProblem, target: Target, given: Given, tolerances: Tol
 
 
 @jax.jit
-def _cost(problem, matches, given, tolerances, state):
+def _cost(
+    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState
+) -> Float[Array, ""]:
     return half_squares(scan_residuals(problem, matches, given, tolerances, state))
 
 
@@ -219,7 +221,7 @@ def search_starts(surface: BodySurface, scan: Scan, kept: int) -> list[Start]:
     return _different(sorted(starts, key=lambda start: start.cost), kept)
 
 
-def _stances(joint_names):
+def _stances(joint_names: tuple[str, ...]) -> Iterator[Float[np.ndarray, "j 3"]]:
     """(j, 3) rotations of each stance; joints that the body lacks are left out."""
     for turns in STANCES.values():
         rotations = pose_prior(joint_names).mean.copy()
@@ -230,7 +232,9 @@ def _stances(joint_names):
         yield rotations
 
 
-def _stance_points(surface, stance):
+def _stance_points(
+    surface: BodySurface, stance: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "3"], float]:
     """Evenly spread points of the mean body in a stance about their centre and over their size; centre and size, metres."""
     betas = jnp.zeros(surface.points.directions.shape[-1])
     posed = pose_surface(surface, betas, BodyPose(jnp.asarray(stance, jnp.float32), jnp.zeros(3)))
@@ -244,7 +248,7 @@ def _stance_points(surface, stance):
     return (points - middle) / size, middle, size
 
 
-def _grid():
+def _grid() -> Float[np.ndarray, "turns 3 3"]:
     """Rotations from all sides: the body's axis along many directions, turned about it in steps."""
     found = []
     for up in directions_around(TURNS):
@@ -256,7 +260,7 @@ def _grid():
     return np.stack(found)
 
 
-def _different(starts, kept):
+def _different(starts: Sequence[Start], kept: int) -> list[Start]:
     """The first ones, at most `ALIKE` of those that are turned alike."""
     chosen: list[Start] = []
     for start in starts:
@@ -289,7 +293,7 @@ def facing_back(
     return Start(move.after(Similarity(size, np.eye(3), np.zeros(3))).after(start.align), swapped, start.cost)
 
 
-def _other_side(name):
+def _other_side(name: str) -> str:
     side, _, part = name.partition("_")
     return {"left": f"right_{part}", "right": f"left_{part}"}.get(side, name)
 

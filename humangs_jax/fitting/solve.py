@@ -65,7 +65,14 @@ def solve(
         return _solve(residuals, start, steps, method, tolerance, free)
 
 
-def _solve(residuals, start, steps, method, tolerance, free):
+def _solve(
+    residuals: Callable[[T], PyTree],
+    start: T,
+    steps: int,
+    method: Literal["lbfgs", "lm"],
+    tolerance: float,
+    free: T | None,
+) -> tuple[T, Outcome]:
     import lineax
     import optimistix
 

@@ -115,7 +115,7 @@ def violations(
     return [(int(j), int(a), float(beyond[j, a])) for j, a in np.argwhere(beyond > slack)]
 
 
-def _range_of(name, unknown):
+def _range_of(name: str, unknown: Range) -> list[Float[np.ndarray, "3"]]:
     if not name.startswith("right_"):
         own = RANGES.get(name, unknown)
         return [np.asarray(x, float) for x in (own.mean, own.std, own.lower, own.upper)]
@@ -351,7 +351,7 @@ def with_cameras(origin: Origin, cameras: Camera) -> Origin:
     return replace(origin, cameras=replace(origin.views, K=cameras.K))
 
 
-def _numbered(rows, same):
+def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " n"]:
     """Numbers from 0 of rows (v, n): those that equal an earlier one have its number."""
     numbers, known = np.zeros(len(rows), np.int32), np.empty((0, rows.shape[1]))
     for i, row in enumerate(rows):

@@ -15,6 +15,7 @@ A view agrees with a landmark by how near its keypoint is to the best of the poi
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -189,7 +190,7 @@ def agreement(observations: Observations, mirror: Int[Array, " k"] | Int[np.ndar
     return jax.lax.map(lambda seen: _of_frame(seen, mirror), observations)
 
 
-def _of_frame(seen, mirror):
+def _of_frame(seen: Observations, mirror: Int[Array | np.ndarray, " k"]) -> Agreement:
     points, counts, weights = triangulate_robustly(seen)
 
     def near(keypoints, confidences):
@@ -304,7 +305,7 @@ class _Search:
         return [trial for gains, *where in columns if (trial := self.trial(gains, every, *where)).clear]
 
 
-def _cameras(best, tried, views, names):
+def _cameras(best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]) -> Swap:
     """The swap of the best exchange, and the others of the same frames that gain as much."""
     name = lambda trial: tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
     alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
@@ -312,7 +313,13 @@ def _cameras(best, tried, views, names):
     return Swap("cameras", name(best), best.share, tuple(others), len(best.frames))
 
 
-def _sides(observations, views, order, shares, names):
+def _sides(
+    observations: Observations,
+    views: Int[np.ndarray, "m c"],
+    order: Order,
+    shares: Float[np.ndarray, "m c"],
+    names: Sequence[str],
+) -> list[Swap]:
     """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
@@ -324,7 +331,7 @@ def _sides(observations, views, order, shares, names):
     return found
 
 
-def _camera_numbers(observations, views):
+def _camera_numbers(observations: Observations, views: Int[np.ndarray, "m c"]) -> Int[np.ndarray, "m c"]:
     """(m, c) equal for views of one camera that stands still; -1 where there is no view."""
     there = np.nonzero(views >= 0)
     matrices = (np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world))

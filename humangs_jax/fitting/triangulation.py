@@ -86,7 +86,7 @@ def reprojection_errors(observations: Observations, points: Float[Array, "k 3"])
     return jnp.where(before, jnp.linalg.norm(pixels - observations.points, axis=-1), 1e6)
 
 
-def _rays(observations):
+def _rays(observations: Observations) -> tuple[Float[Array, "c 3"], Float[Array, "c k 3"]]:
     """Camera centres (c, 3) and unit directions (c, k, 3) of the detections in the world."""
     rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
@@ -97,7 +97,9 @@ def _rays(observations):
     return -jnp.einsum("cba,cb->ca", rotation, translation, precision=EXACT), directions
 
 
-def _nearest(origins, directions, weights):
+def _nearest(
+    origins: Float[Array, "c 3"], directions: Float[Array, "c k 3"], weights: Float[Array, "c k"]
+) -> Float[Array, "k 3"]:
     """The points (k, 3) nearest to weighted rays."""
     center = jnp.mean(origins, axis=0)  # against rounding far from the world's origin
     across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]

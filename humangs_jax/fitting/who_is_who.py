@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool, Float, Int
 
 AGREE = 0.06
 """Median distance of landmarks from the triangulated points, a share of the person's size in the photo, up to which a view shows
@@ -35,6 +35,12 @@ class Seen(NamedTuple):
     K: Float[np.ndarray, "3 3"]
     cam_from_world: Float[np.ndarray, "4 4"]
     people: tuple[Float[np.ndarray, "k 3"], ...]
+
+
+Key = tuple[int, int]
+"""A view, and a person in it."""
+Proposal = tuple[float, Key, Key, bool, Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]
+"""Error, two people, whether the sides of the second are exchanged, points, and which of them are known."""
 
 
 class Match(NamedTuple):
@@ -81,7 +87,9 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
     return matches
 
 
-def _gathered(views, mirror, available, proposal):
+def _gathered(
+    views: Sequence[Seen], mirror: Int[np.ndarray, " k"], available: set[Key], proposal: Proposal
+) -> tuple[dict[Key, bool], float]:
     """The members of a proposal and of the other views where they agree: {(view, person): exchanged}, and the error."""
     _, first, second, flip, points, known = proposal
     group, errors = {first: False, second: flip}, [proposal[0]]
@@ -103,12 +111,12 @@ def _gathered(views, mirror, available, proposal):
     return group, float(np.mean(errors))
 
 
-def _is_exchanged(plain, exchanged):
+def _is_exchanged(plain: float, exchanged: float) -> bool:
     """From two errors. Of a small or thin person left and right hardly differ: then nothing is exchanged."""
     return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
 
 
-def _match(views, mirror, group, error):
+def _match(views: Sequence[Seen], mirror: Int[np.ndarray, " k"], group: dict[Key, bool], error: float) -> Match:
     members: list[int | None] = [None] * len(views)
     mirrored = [False] * len(views)
     for (v, p), flipped in group.items():
@@ -139,7 +147,9 @@ def _triangulated(
     return points, known & np.isfinite(points).all(-1)
 
 
-def _error(view, row, points, known):
+def _error(
+    view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Bool[np.ndarray, " k"]
+) -> float:
     """Median distance of landmarks from points over the size of the person; infinite behind the camera or with few in common."""
     seen = known & (row[:, 2] >= SEEN)
     if seen.sum() < FEWEST:

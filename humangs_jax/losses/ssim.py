@@ -51,10 +51,10 @@ UNIFORM = SsimWindow(7, None)
 TORCHMETRICS = SsimWindow(sample=False)
 
 
-def _windowed(x, window):
+def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
     height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
-    rows = sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights))
-    return sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(window.weights))
+    rows = jnp.asarray(sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights)))
+    return jnp.asarray(sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(window.weights)))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
@@ -68,7 +68,9 @@ def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Ar
     return _windowed(x, window)
 
 
-def _blur_transposed(window, _, gradient):
+def _blur_transposed(
+    window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]
+) -> tuple[Float[Array, "*b h w c"]]:
     # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
     # pad and add once per slice, which takes four times as long
     margin = (window.size - 1, window.size - 1)

@@ -144,15 +144,19 @@ def _convolve(x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]) -> Fl
 
 
 @jax.custom_vjp
-def _convolve_on_cpu(x, kernel):
+def _convolve_on_cpu(x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]) -> Float[Array, "v h w d"]:
     return _convolve(x, kernel)
 
 
-def _forward(x, kernel):
+def _forward(
+    x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]
+) -> tuple[Float[Array, "v h w d"], tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]]]:
     return _convolve(x, kernel), (x, kernel)
 
 
-def _backward(residuals, cotangent):
+def _backward(
+    residuals: tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]], cotangent: Float[Array, "v h w d"]
+) -> tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]]:
     x, kernel = residuals
     x_gradient = _convolve(cotangent, jnp.swapaxes(kernel[::-1, ::-1], 2, 3))
     # channels of x are the batch, views are what is contracted, the cotangent's pixels are the window

@@ -291,7 +291,7 @@ class _Bands(NamedTuple):
     inverse: Float[Array, " g"]
     reach: Float[Array, " g"]
 
-    def columns(self, row, grid: TileGrid):
+    def columns(self, row: Int[Array, " g"], grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First and last tile of each ellipse within one row of tiles."""
         size = grid.tile_size
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)

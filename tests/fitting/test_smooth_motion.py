@@ -1,7 +1,5 @@
 """Smooth motion of a body of four joints: frames that are badly seen neither ruin the others nor their own."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,7 +120,7 @@ def test_somebody_else_in_one_frame_does_not_move_the_others(walk):
     fit = smoothed(replace(seen, points=jnp.asarray(points)), (rotations, translations))
     errors = centimetres(fit, joints)
     assert errors[[0, 1, 2, 4, 5, 6]].max() < 1.0
-    (warning,) = _motion_warnings(fit, STD)
+    (warning,) = _motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), STD)
     assert warning.startswith("frame 3: 0.9") and "somebody else" in warning
 
 
@@ -134,7 +132,9 @@ def test_smoothness_that_the_keypoints_contradict_is_not_forced(walk):
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
     fit = smoothed(seen_by(landmarks), (rotations, translations))
     assert float(fit.smoothness) == pytest.approx(4 * STD) and centimetres(fit, joints).max() < 1.0
-    assert next(iter(_motion_warnings(fit, STD))).startswith("smoothness 0.003: the keypoints contradict it")
+    assert next(iter(_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), STD))).startswith(
+        "smoothness 0.003: the keypoints contradict it"
+    )
 
 
 @pytest.mark.slow
@@ -164,9 +164,7 @@ def test_frames_without_keypoints_are_bridged_on_the_shortest_way(walk):
 
 def test_what_became_of_smooth_motion_is_told():
     joints = np.zeros((5, 4, 3)) + 0.05 * np.arange(5)[:, None, None]
-    found = lambda held, joints=joints: list(
-        _motion_warnings(SimpleNamespace(noise=np.ones(len(joints)), joints=joints, smoothness=held), 0.01)
-    )
+    found = lambda held, joints=joints: list(_motion_warnings(joints, held, 0.01))
     assert found(0.01) == []
     assert "accelerations are held to 0.16 instead" in found(0.16)[0]
     assert "frames are fitted one by one" in found(0.0)[0]

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.export import Up
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
@@ -88,7 +88,7 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
     return replace(gaussians, means=means, quats=quats)
 
 
-def _matrix(turn):
+def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
     """Of 0 and +-1."""
     with jax.ensure_compile_time_eval():  # the turn is known inside of transformations, too
         return np.asarray(quaternion.to_matrix(jnp.asarray(turn)), np.float32).round()
@@ -213,11 +213,11 @@ def write_spz(path: str | os.PathLike, gaussians: Gaussians) -> None:
     write_bytes(path, gzip.compress(data, 9, mtime=0))
 
 
-def _byte(values):
+def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
     return np.clip(np.rint(values), 0, 255).astype("u1")
 
 
-def _packed_quaternions(quats):
+def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
     """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
     xyzw = quats[:, [1, 2, 3, 0]]
     largest = np.argmax(np.abs(xyzw), axis=1)

@@ -15,6 +15,7 @@ import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -209,7 +210,7 @@ def strongest(weights: Float[np.ndarray, "n j"]) -> tuple[Int[np.ndarray, "n 4"]
     return np.where(kept > 0, joints, 0), kept
 
 
-def _joint_nodes(avatar, mesh):
+def _joint_nodes(avatar: Avatar, mesh: BodyMesh) -> list[dict[str, Any]]:
     """Every joint at its place relative to its parent's; the root so that T-pose stands on 0."""
     joints = np.asarray(avatar.rest_joints, np.float64)
     nodes = []
@@ -221,12 +222,12 @@ def _joint_nodes(avatar, mesh):
     return nodes
 
 
-def _armature(avatar, up):
+def _armature(avatar: Avatar, up: Up) -> dict[str, Any]:
     w, *xyz = up_turn(up)
     return {"name": "armature", "rotation": [*xyz, w], "children": [avatar.parents.index(-1)]}
 
 
-def _primitive(writer, mesh):
+def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
     joints, weights = strongest(mesh.weights)
     small = "u1" if mesh.weights.shape[1] <= 256 else "<u2"
     attributes = {
@@ -240,7 +241,7 @@ def _primitive(writer, mesh):
     return {"attributes": attributes, "indices": indices, "material": 0}
 
 
-def _skin(writer, avatar):
+def _skin(writer: GlbWriter, avatar: Avatar) -> dict[str, Any]:
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
     matrices[:, 3, :3] = -np.asarray(avatar.rest_joints)  # column by column, as glTF has them
     inverse = writer.array("MAT4", matrices.reshape(-1, 16))
@@ -251,7 +252,7 @@ def _skin(writer, avatar):
     }
 
 
-def _animation(writer, avatar, motion, name):
+def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> dict[str, Any]:
     """Every joint that turns, and where the root is."""
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)
@@ -270,7 +271,7 @@ def _animation(writer, avatar, motion, name):
     return {"name": name, "channels": channels, "samplers": samplers}
 
 
-def _continuous(quats):
+def _continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
     """Quaternions (m, j, 4) of unit length, each on the side of the one before: some players interpolate numbers."""
     quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
     jumps = (quats[1:] * quats[:-1]).sum(axis=-1, keepdims=True) < 0
@@ -278,7 +279,7 @@ def _continuous(quats):
     return quats * np.cumprod(signs, axis=0)
 
 
-def _png(texture):
+def _png(texture: UInt8[np.ndarray, "t t c"]) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()

@@ -16,7 +16,7 @@ import numpy as np
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, PosedBody, RestBody, pose_body, shape_body
 from humangs_jax.body.smplx import HandBasis, load_hands
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.capture_checks import CaptureError, file_numbers
 from humangs_jax.io import arrays as array_files
@@ -180,7 +180,9 @@ def recover_shape(
 
 
 @functools.lru_cache(maxsize=2)
-def _shape_solvers(body: FileBody):
+def _shape_solvers(
+    body: FileBody,
+) -> tuple[tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...]:
     """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of all vertices, then
     without the hands.
     """

@@ -123,7 +123,7 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     return video_subject(main, cameras, shown, masks, read, parameters, digits=6)
 
 
-def _parameters(notes, body):
+def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
     poses = notes.numbers("SMPLx/fullpose", (None, len(body.model.parents), 3), LARGEST_ANGLE)
     translations = notes.numbers("SMPLx/transl", (len(poses), 3), FARTHEST)
     rotations = poses.copy()
@@ -132,7 +132,7 @@ def _parameters(notes, body):
     return BodyParameters(coefficients(body.model, shape[0], shape[1], notes.path), rotations, translations)
 
 
-def _camera(notes, number, photos, first):
+def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> CalibratedCamera:
     at = f"Camera_Parameter/{number:02d}"
     K, pose = notes.numbers(f"{at}/K", (3, 3)), notes.numbers(f"{at}/RT", (4, 4))
     R = pose[:3, :3]
@@ -145,7 +145,7 @@ def _camera(notes, number, photos, first):
     return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), width or 1, height or 1, lens)
 
 
-def _size(photos, key):
+def _size(photos: Smc, key: str) -> tuple[int, int]:
     data = photos.array(key, "image_bytes")
     with reading(f"{photos.path}: {key}", "image", CaptureError), image_in(data.astype(np.uint8).tobytes()) as image:
         return image.size

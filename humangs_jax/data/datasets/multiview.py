@@ -40,6 +40,7 @@ from humangs_jax.data.datasets.bodies import (
 )
 from humangs_jax.data.datasets.subject import Subject
 from humangs_jax.data.photos import read_checked
+from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.images import read_grey, read_image
 from humangs_jax.io.reading import read_text
 
@@ -70,7 +71,7 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     return BodyParameters(betas, rotations.reshape(count, -1, 3), translations)
 
 
-def _first_row(values, key, count):
+def _first_row(values: ArrayFile, key: str, count: int) -> Float[np.ndarray, " s"]:
     array = values.numbers(key, (None,) * values.array(key).ndim, LARGEST_COEFFICIENT)
     if array.ndim == 1:
         return array

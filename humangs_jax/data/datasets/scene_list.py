@@ -98,7 +98,7 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
     return tuple(Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items())
 
 
-def _first_size(file, scenes):
+def _first_size(file: Path, scenes: Mapping[str, dict[str, Any]]) -> int:
     """Side of the first image that is there."""
     for name, scene in scenes.items():
         for frame in _frames(scene, file, name)[:1]:
@@ -169,7 +169,7 @@ def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneF
     return views
 
 
-def _array(frame, key, file, at):
+def _array(frame: Mapping[str, Any], key: str, file: Path, at: str) -> np.ndarray:
     value = required(frame, key, file, at)
     try:
         return np.asarray(value)
@@ -177,14 +177,14 @@ def _array(frame, key, file, at):
         raise CaptureError(file, at + key, "expected rows of one length") from None
 
 
-def _frames(scene, file, name):
+def _frames(scene: Mapping[str, Any], file: Path, name: str) -> list[Any]:
     frames = required(scene, "frames", file, f"{name}.")
     if not isinstance(frames, list) or not frames:
         raise CaptureError(file, f"{name}.frames", "expected a list of at least one frame")
     return frames
 
 
-def _present(file, name, scene):
+def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[SceneFrame], dict[str, int]]:
     """Frames whose image and arrays are there, and how many are not."""
     views, missing = [], {"no image": 0, "no smpl_path": 0}
     known: dict[str, bool] = {}
@@ -202,16 +202,18 @@ def _present(file, name, scene):
     return views, {reason: count for reason, count in missing.items() if count}
 
 
-def _inside(file, name, path):
+def _inside(file: Path, name: str, path: Any) -> Path:
     with reading(f"{file}: {name}", "path", CaptureError):
         return inside(file.parent, path, photo=True)
 
 
-def _view_size(file, name, view):
+def _view_size(file: Path, name: str, view: SceneFrame) -> tuple[int, int]:
     return read_checked(image_size, _inside(file, name, view.image))
 
 
-def _read_view(file, name, view):
+def _read_view(
+    file: Path, name: str, view: SceneFrame
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:
     path = _inside(file, name, view.image)
     image, alpha = read_checked(read_image, path)
     if view.mask is not None:

@@ -237,7 +237,7 @@ def read_scan(file: str | Path) -> Scan:
         return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, texture)
 
 
-def _find_fault(folder):
+def _find_fault(folder: Path) -> None:
     """Raises: FileError for the first image of a folder that cannot be read."""
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in PHOTO_SUFFIXES:

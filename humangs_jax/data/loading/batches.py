@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.core.array_types import Array
 from humangs_jax.data.loading.examples import Example, Source, input_count_at
 
 T = TypeVar("T")
@@ -94,7 +95,7 @@ class Loader:
         """Whom that row shows, in words."""
         return self.source.describe(self.seed, self._number(step, row), self.input_count(step))
 
-    def _number(self, step, row):
+    def _number(self, step: int, row: int) -> int:
         return self.first_example + (step - self.first_step) * self.batch_size + row
 
     def batch_at(self, step: int) -> Example:
@@ -129,7 +130,7 @@ class Loader:
 
         return prefetched(make, AHEAD, waiting)
 
-    def _place(self, examples):
+    def _place(self, examples: list[Example]) -> Example:
         """Stack the rows of this process and put them on the devices."""
         batch = jax.tree.map(_stack, *examples)
         sharding = self.sharding
@@ -147,7 +148,7 @@ class Loader:
         return jax.tree.map(place, batch)
 
 
-def _stack(*leaves):
+def _stack(*leaves: Array | np.ndarray) -> Array | np.ndarray:
     """Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])

@@ -94,19 +94,19 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     )
 
 
-def _same_body(name, folder, body_file):
+def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
     """Whether a capture in `folder` that calls its body `name` has the one of `body_file`."""
     if DEFAULT_BODY in (name, str(body_file)):
         return name == str(body_file)
     return (folder / name).resolve() == Path(body_file).resolve()
 
 
-def _check_image(file):
+def _check_image(file: Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether there is an alpha channel)."""
     return read_checked(check_image, file)
 
 
-def _check_inputs(seen, inputs):
+def _check_inputs(seen: StoredSubject, inputs: Sequence[int]) -> None:
     """Whether the masks of the first views, the inputs, show somebody: a white photo would be read as the person."""
     empty = [view for view, mask in zip(inputs, seen.masks, strict=False) if not (mask > MASK_THRESHOLD * 255).any()]
     if empty:
@@ -237,7 +237,9 @@ class PeopleCache:
         if count == len({person.name for person in self.people}):
             raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
 
-    def _keep(self, name, view, image, mask):
+    def _keep(
+        self, name: Path | str, view: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
+    ) -> None:
         size = image.nbytes + mask.nbytes
         with self._lock:
             if (name, view) not in self._images and size <= self._free_bytes:
@@ -298,7 +300,7 @@ class CaptureSource:
         """See `Source`: the folder."""
         return str(self._found(seed, index, input_count)[0])
 
-    def _found(self, seed, index, input_count):
+    def _found(self, seed: int, index: int, input_count: int) -> tuple[Path | str, Example]:
         """The folder and the example."""
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))

@@ -138,7 +138,7 @@ def draw_views(
     return inputs, generator.choice(np.flatnonzero(free), sampling.target_count, replace=False).tolist()
 
 
-def _draw_from_window(generator, count, wanted):
+def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -> list[int]:
     """The two ends of a random window and random views inside, `wanted` in all."""
     smallest, largest = (min(count - 1, round(count * views / WINDOW_OF)) for views in WINDOW)
     distance = int(generator.integers(max(smallest, wanted - 1), max(largest, wanted - 1) + 1))

@@ -5,6 +5,7 @@ What a file does not have (fingers, eyes) is 0.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.formats import MOTIONS
+from humangs_jax.data.formats import MOTIONS, ArrayKeys
 from humangs_jax.data.motion.motion import MotionError, Poses, Reading
 from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, HAND_NUMBERS, MILLIMETRES
 from humangs_jax.io.arrays import ArrayFile
@@ -34,7 +35,11 @@ def read_arrays(path: Path, options: Reading) -> Poses:
 # Formats ---------------------------------------------------------------------------------------------------------------
 
 
-def _ours(file, form):
+Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]
+"""Rotations and translations of the frames."""
+
+
+def _ours(file: "_MotionFile", form: ArrayKeys) -> Moves:
     key = form.poses[0]
     if not file.flat_hand_mean:
         raise MotionError(file.path, key, "our own format holds whole rotations: expected flat_hand_mean=True")
@@ -42,7 +47,7 @@ def _ours(file, form):
     return rotations, file.numbers(form.moves[0], (len(rotations), 3))
 
 
-def _whole(file, form):
+def _whole(file: "_MotionFile", form: ArrayKeys) -> Moves:
     key = form.poses[0]
     poses = file.numbers(key, None)
     count, columns = len(poses), poses[0].size
@@ -63,21 +68,21 @@ def _whole(file, form):
     return rotations, file.numbers(file.first(form.moves), (count, 3))
 
 
-def _scaled(file, form):
+def _scaled(file: "_MotionFile", form: ArrayKeys) -> Moves:
     key = form.poses[0]
     poses = file.numbers(key, None)
     poses = poses.reshape(len(poses), -1) if poses.ndim == 3 else poses
     if poses.ndim != 2 or poses.shape[1] != 72:
         raise MotionError(file.path, key, f"expected shape (frames, 72), got {poses.shape}")
     scale = MILLIMETRES
-    if form.scaling in file.values:
+    if form.scaling is not None and form.scaling in file.values:
         scale = float(file.numbers(form.scaling, None).reshape(-1)[0])
         if not scale > 0:
             raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
     return file.assemble(poses[:, :BODY_NUMBERS]), file.numbers(form.moves[0], (len(poses), 3)) / scale
 
 
-def _parts(file, form):
+def _parts(file: "_MotionFile", form: ArrayKeys) -> Moves:
     root, body, *others = form.poses
     orient = file.numbers(root, None)
     count = len(orient)
@@ -150,7 +155,12 @@ class _MotionFile(ArrayFile):
         """A hand's pose (m, 45) from that of a file, which may be relative to the mean hand."""
         return hand if self.flat_hand_mean or self.hands is None else hand + np.asarray(self.hands.means)[side]
 
-    def assemble(self, body, face=None, hands=None):
+    def assemble(
+        self,
+        body: Float[np.ndarray, "m 66"],
+        face: Sequence[Float[np.ndarray, "m 3"] | None] | None = None,
+        hands: Sequence[Float[np.ndarray, "m 45"] | None] | None = None,
+    ) -> Float[np.ndarray, "m j 3"]:
         """(m, 55, 3) from (m, 66) and parts that may be None."""
         zeros = lambda columns: np.zeros((len(body), columns))
         face = [zeros(3) if part is None else part for part in face or [None] * 3]
@@ -158,7 +168,7 @@ class _MotionFile(ArrayFile):
         return np.concatenate([body, *face, *hands], axis=1).reshape(len(body), -1, 3)
 
 
-def _read_json_frames(path):
+def _read_json_frames(path: Path) -> dict[str, list[Any]]:
     """One JSON file per frame (a folder: all of them, in the order of their numbers), stacked by key."""
     files = [path]
     if path.is_dir():

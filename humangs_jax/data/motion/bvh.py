@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_text
 
@@ -40,7 +41,7 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     return Clip(names, parents, _chained(parents, offsets), turns, places, 1 / seconds)
 
 
-def _tree(text):
+def _tree(text: str) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
     """Names, parents, offsets and channels of the joints, parents first; the ends of limbs are left out."""
     found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
     words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
@@ -85,7 +86,7 @@ def _tree(text):
     return tuple(names), tuple(parents), np.stack(offsets), channels
 
 
-def _number(word):
+def _number(word: str) -> float:
     try:
         value = float(word)
     except ValueError:
@@ -95,7 +96,7 @@ def _number(word):
     return value
 
 
-def _numbers(text):
+def _numbers(text: str) -> Float[np.ndarray, " n"]:
     try:
         values = np.fromstring(text, np.float64, sep=" ")
     except ValueError as error:
@@ -105,7 +106,7 @@ def _numbers(text):
     return values
 
 
-def _chained(parents, offsets):
+def _chained(parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
     places = offsets.copy()
     places[0] = 0
     for joint, parent in enumerate(parents):
@@ -114,7 +115,12 @@ def _chained(parents, offsets):
     return places
 
 
-def _posed(parents, offsets, channels, numbers):
+def _posed(
+    parents: tuple[int, ...],
+    offsets: Float[np.ndarray, "s 3"],
+    channels: list[list[str]],
+    numbers: Float[np.ndarray, "m n"],
+) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
     """Rotations (m, s, 3, 3) and places (m, s, 3) of all joints in the world."""
     frames = len(numbers)
     turns, places = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))

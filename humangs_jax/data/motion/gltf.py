@@ -4,18 +4,27 @@ https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations. The rest p
 mesh (inverse bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated linearly.
 """
 
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import DEFAULT_FPS
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
+
+
+Nodes = list[dict[str, Any]]
+Track = tuple[Float[np.ndarray, " keys"], Float[np.ndarray, "keys c"], bool]
+"""Times, values, and whether these stay until the next."""
+Tracks = dict[tuple[int, str], Track]
+"""By node and path."""
 
 
 def read_animation(path: Path, options: object = None) -> Clip:
@@ -43,7 +52,7 @@ def read_animation(path: Path, options: object = None) -> Clip:
     return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, up="y")
 
 
-def _parents(nodes):
+def _parents(nodes: Nodes) -> list[int]:
     """Parent of each node, -1 for roots. Raises: Refused for a node with two parents."""
     parents = [-1] * len(nodes)
     for i, node in enumerate(nodes):
@@ -54,7 +63,9 @@ def _parents(nodes):
     return parents
 
 
-def _joints(content, binary, nodes):
+def _joints(
+    content: dict[str, Any], binary: bytes, nodes: Nodes
+) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far as the file tells."""
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -71,7 +82,7 @@ def _joints(content, binary, nodes):
     return joints, dict(zip(joints, np.linalg.inv(inverse), strict=True))
 
 
-def _with_ancestors(joints, parents):
+def _with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
     """Joints and the nodes above them, parents first. Raises: Refused for nodes that are above themselves."""
     order: list[int] = []
     placed: set[int] = set()
@@ -87,14 +98,14 @@ def _with_ancestors(joints, parents):
     return order
 
 
-def _next_joint(parents, joint, joints):
+def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
     joint = parents[joint]
     while joint != -1 and joint not in joints:
         joint = parents[joint]
     return joint
 
 
-def _tracks(content, binary, animation, wanted):
+def _tracks(content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]) -> Tracks:
     """(times, values) by node and path, of the nodes that are wanted."""
     tracks: dict[tuple[int, str], Any] = {}
     for channel in animation["channels"]:
@@ -118,7 +129,7 @@ def _tracks(content, binary, animation, wanted):
     return tracks
 
 
-def _times(tracks):
+def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     """Times of the frames in seconds, as close as those of the densest track, and their rate."""
     first, last = (pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1)))
     dense = max((times for times, _, _ in tracks.values()), key=len)
@@ -131,7 +142,9 @@ def _times(tracks):
     return first + np.arange(count) / fps, fps
 
 
-def _world(nodes, parents, order, tracks, times):
+def _world(
+    nodes: Nodes, parents: Sequence[int], order: Sequence[int], tracks: Tracks, times: Float[np.ndarray, " m"]
+) -> dict[int, Float[np.ndarray, "m 4 4"]]:
     """Matrices (m, 4, 4) of the nodes at some times."""
     world: dict[int, np.ndarray] = {}
     for i in order:
@@ -140,7 +153,9 @@ def _world(nodes, parents, order, tracks, times):
     return world
 
 
-def _local(node, tracks, times):
+def _local(
+    node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "m 4 4"]:
     local = np.tile(np.eye(4), (len(times), 1, 1))
     if "matrix" in node:
         local[:] = np.asarray(node["matrix"], np.float64).reshape(4, 4).T
@@ -157,7 +172,7 @@ def _local(node, tracks, times):
     return local
 
 
-def _sampled(track, times, path):
+def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
     keys, values, stepped = track
     if stepped or len(keys) == 1:
         times = times + 0.01 * (times[1] - times[0] if len(times) > 1 else 1.0)  # keys are rounded to float32
@@ -168,7 +183,7 @@ def _sampled(track, times, path):
     return np.stack([np.interp(times, keys, column) for column in values.T], axis=1)
 
 
-def _rotations(matrices):
+def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
     """The rotations in matrices of rotation and scale. Raises: Refused where there is none."""
     linear = matrices[..., :3, :3]
     lengths = np.linalg.norm(linear, axis=-2, keepdims=True)
@@ -178,6 +193,6 @@ def _rotations(matrices):
     return Rotation.from_matrix(flat).as_matrix().reshape(linear.shape)
 
 
-def _check(values, what):
+def _check(values: Float[np.ndarray, "..."], what: str) -> None:
     if not np.isfinite(values).all():
         raise Refused(f"{what}: expected finite numbers")

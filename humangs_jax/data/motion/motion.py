@@ -68,7 +68,13 @@ class Motion:
 
 
 @jax.jit
-def _between(rotations, translations, next_rotations, next_translations, share):
+def _between(
+    rotations: Float[Array, "m j 3"],
+    translations: Float[Array, "m 3"],
+    next_rotations: Float[Array, "m j 3"],
+    next_translations: Float[Array, "m 3"],
+    share: Float[Array, " m"],
+) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
     """Frames between frames; those with share 0 as they are."""
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)
@@ -214,7 +220,12 @@ def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion
 
 
 @functools.partial(jax.jit, static_argnames="parents")
-def _joint_paths(rest_joints, parents, rotations, translations):
+def _joint_paths(
+    rest_joints: Float[Array, "j 3"],
+    parents: tuple[int, ...],
+    rotations: Float[Array, "m j 3"],
+    translations: Float[Array, "m 3"],
+) -> Float[Array, "m j 3"]:
     """(m, j, 3) joints in space."""
     transforms = jax.vmap(skinning.joint_transforms, in_axes=(None, None, 0, 0))
     transforms = transforms(rest_joints, parents, rotations, translations)

@@ -5,6 +5,7 @@ The page reads motions too. `page_rules` is put into it when it is assembled (vi
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -174,7 +175,7 @@ def up_axis(
     )
 
 
-def _floors(points, axes, fps):
+def _floors(points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int) -> list[float]:
     """Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer."""
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
@@ -189,13 +190,13 @@ def _floors(points, axes, fps):
     return rests if max(rests) >= ON_THE_FLOOR else [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
 
 
-def _opposite(a, b):
+def _opposite(a: str, b: str) -> bool:
     return a.lstrip("-") == b.lstrip("-") and a != b
 
 
-def _on_hands(points, up):
+def _on_hands(points: Float[np.ndarray, "pairs s 3"], up: str) -> bool:
     """Whether the lowest joint is one of the arms most of the time."""
-    return np.isin((points[::2] @ upright_matrix(up)[1]).argmin(axis=1), HANDS).mean() > 0.5
+    return float(np.isin((points[::2] @ upright_matrix(up)[1]).argmin(axis=1), HANDS).mean()) > 0.5
 
 
 def joint_places(

@@ -22,6 +22,7 @@ as high above the floor as in the file, whatever the shares of thighs, shins and
 import dataclasses
 import functools
 import re
+from collections.abc import Mapping, Sequence
 from importlib import resources
 
 import numpy as np
@@ -121,7 +122,11 @@ def retargeted(
     return rotations, moves - joints[0], said
 
 
-def _up_of(clip, source, scale, standing):
+Source = Mapping[str, int]
+"""Our names of joints -> indices of the file's."""
+
+
+def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[str, str]:
     """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people stand does."""
     usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
     trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
@@ -137,7 +142,7 @@ _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 # Names ------------------------------------------------------------------------------------------------------------------
 
 
-def _matched(clip):
+def _matched(clip: Clip) -> dict[str, int]:
     """Index of the clip's joint for each joint of ours that it has."""
     names = [re.sub(r"^.*[:|]", "", name) for name in clip.names]
     names = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
@@ -161,12 +166,12 @@ def _matched(clip):
     return source
 
 
-def _common_start(names):
+def _common_start(names: Sequence[str]) -> int:
     """How many first letters are the same in all names."""
     return next((i for i, letters in enumerate(zip(*names, strict=False)) if len(set(letters)) > 1), 0)
 
 
-def _match_spine(clip, source):
+def _match_spine(clip: Clip, source: dict[str, int]) -> None:
     """Spines have one to five joints, called differently everywhere: ours are the first, middle and last of the file's."""
     chain = []
     at = clip.parents[source["neck"]] if "neck" in source else clip.parents[source["head"]] if "head" in source else -1
@@ -182,20 +187,27 @@ def _match_spine(clip, source):
 # Rest poses -------------------------------------------------------------------------------------------------------------
 
 
-def _top(source):
+def _top(source: Source) -> str:
     return next(name for name in TOPS if name in source)
 
 
-def _spine(clip, source):
+def _spine(clip: Clip, source: Source) -> Float[np.ndarray, "3"]:
     return unit(clip.rest[source[_top(source)]] - clip.rest[source["pelvis"]])
 
 
-def _stands(clip, source):
+def _stands(clip: Clip, source: Source) -> bool:
     legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in SIDES)
     return float(unit(legs) @ _spine(clip, source)) < STANDING
 
 
-def _body_turns(clip, source, joints, turns, places, by_motion):
+def _body_turns(
+    clip: Clip,
+    source: Source,
+    joints: Float[np.ndarray, "j 3"],
+    turns: Float[np.ndarray, "m s 3 3"],
+    places: Float[np.ndarray, "m s 3"],
+    by_motion: bool,
+) -> list[Float[np.ndarray, "m 3 3"]]:
     """G_j (m, 3, 3) of our joints in the world."""
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
@@ -218,7 +230,9 @@ def _body_turns(clip, source, joints, turns, places, by_motion):
     return world
 
 
-def _pelvis_turns(clip, source, turns, places):
+def _pelvis_turns(
+    clip: Clip, source: Source, turns: Float[np.ndarray, "m s 3 3"], places: Float[np.ndarray, "m s 3"]
+) -> Float[np.ndarray, "m 3 3"]:
     """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the
     trunk, turned so that the line of the hips is the file's.
     """
@@ -254,7 +268,7 @@ def _pelvis_turns(clip, source, turns, places):
     return Rotation.from_rotvec(tilt[:, None] * unit(line)).as_matrix() @ own
 
 
-def _pelvis_frame(clip, source, joints):
+def _pelvis_frame(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "3 3"]:
     """From our rest frame to the file's, by the line of the hips and the direction of the spine."""
     theirs = clip.rest[source["left_hip"]] - clip.rest[source["right_hip"]]
     top = joints[_INDEX[_top(source)]] - joints[0]
@@ -262,13 +276,13 @@ def _pelvis_frame(clip, source, joints):
     return _frame(theirs, _spine(clip, source)) @ ours.T
 
 
-def _frame(right, up):
+def _frame(right: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     x = unit(right)
     z = unit(np.cross(x, up))
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _untwist(turns, bone):
+def _untwist(turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation about a bone that takes the mean twist about it out of rotations (m, 3, 3).
 
     The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs those less that swing far.
@@ -281,17 +295,17 @@ def _untwist(turns, bone):
 # Steps and the floor ----------------------------------------------------------------------------------------------------
 
 
-def _leg_length(places, index):
+def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
     bones = (("left_hip", "left_knee"), ("left_knee", "left_ankle"))
     return sum(float(np.linalg.norm(places[index[b]] - places[index[a]])) for a, b in bones)
 
 
-def _feet(source):
+def _feet(source: Source) -> list[list[str]]:
     """Our names of the joints that may touch the floor: of both sides by kind."""
     return [found for kind in FEET if (found := [name for name in kind if name in source])]
 
 
-def _soles(clip, source, joints):
+def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
     """How high the joints of the file's feet are above the lowest of them in a rest pose that stands, in our metres."""
     axis, _ = nearest_axis(_spine(clip, source))
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
@@ -300,7 +314,9 @@ def _soles(clip, source, joints):
     return {name: height - min(found.values()) for name, height in found.items()}
 
 
-def _steps(heights, source, soles):
+def _steps(
+    heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None
+) -> Float[np.ndarray, " m"]:
     """(m,) how high the feet are above the floor, which is where they are lowest.
 
     soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high as in its lowest frame.
@@ -312,7 +328,12 @@ def _steps(heights, source, soles):
     return feet - feet.min()
 
 
-def _steps_of_body(world, joints, moves, source):
+def _steps_of_body(
+    world: Sequence[Float[np.ndarray, "m 3 3"]],
+    joints: Float[np.ndarray, "j 3"],
+    moves: Float[np.ndarray, "m 3"],
+    source: Source,
+) -> Float[np.ndarray, " m"]:
     """(m,) the same of our body, above a floor at the height of its lowest joint in T-pose."""
     places = {0: moves}
 
@@ -326,9 +347,9 @@ def _steps_of_body(world, joints, moves, source):
     return np.min([place(j)[:, 1] - (joints[j, 1] - joints[feet, 1].min()) for j in feet], axis=0)
 
 
-def _transposed(matrices):
+def _transposed(matrices: Float[np.ndarray, "*b i j"]) -> Float[np.ndarray, "*b j i"]:
     return np.swapaxes(matrices, -1, -2)
 
 
-def _rotation(matrices):
+def _rotation(matrices: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
     return Rotation.from_matrix(matrices).as_rotvec()

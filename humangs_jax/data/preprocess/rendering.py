@@ -7,6 +7,7 @@ the camera has the color of its texture.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +69,7 @@ class ScanRenderer:
         return self._levels(min(level, int(np.log2(min(self.scan.texture.shape[:2])))))
 
     @functools.cached_property
-    def _levels(self):
+    def _levels(self) -> Callable[[int], Float[Array, "th tw 3"]]:
         @functools.lru_cache(maxsize=2)
         def halved(level: int) -> Float[Array, "th tw 3"]:
             step = 1 << level
@@ -92,7 +93,15 @@ def smooth_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f
 
 
 @functools.partial(jax.jit, static_argnames="supersample")
-def _render(vertices, normals, faces, uvs, texture, camera, supersample):
+def _render(
+    vertices: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    faces: Int[Array, "f 3"],
+    uvs: Float[Array, "n 2"],
+    texture: Float[Array, "th tw 3"],
+    camera: Camera,
+    supersample: int,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     fragments = rasterize_mesh(vertices, faces, fine)
     # position, normal and texture coordinate of every sample

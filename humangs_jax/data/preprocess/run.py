@@ -17,11 +17,11 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float, UInt8
+from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY, parameter_arrays
@@ -71,6 +71,9 @@ from humangs_jax.io.reading import write_json
 SKIPPED = "skipped"
 SCENE, CAPTURE = "scene.json", "capture.json"
 Layout = Literal["scenes", "capture"]
+T = TypeVar("T")
+Photo = tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]
+"""An image on white and its mask."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +231,7 @@ def _made_with(settings: Settings) -> dict[str, Any]:
     return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)}}
 
 
-def _skip(out, name, reason):
+def _skip(out: Path, name: str, reason: str) -> None:
     (out / SKIPPED).mkdir(exist_ok=True)
     write_json(out / SKIPPED / f"{name}.json", {"reason": reason})
 
@@ -244,7 +247,7 @@ def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, An
     return manifest
 
 
-def _read_scene(file, settings):
+def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
     """What a finished folder says of itself. Raises: CaptureError naming file and key."""
     content = checked_json(file)
     known = _of_kind(content, "known", dict, file)
@@ -258,17 +261,19 @@ def _read_scene(file, settings):
     return content
 
 
-def _of_kind(mapping, key, kind, file, prefix=""):
+def _of_kind(mapping: Any, key: str, kind: type[T], file: Path, prefix: str = "") -> T:
     value = required(mapping, key, file, prefix) if isinstance(mapping, dict) else None
     if not isinstance(value, kind) or isinstance(value, bool):
         raise CaptureError(file, prefix + key, f"expected {_KINDS[kind]}, got {type(value).__name__}")
     return value
 
 
-_KINDS = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
+_KINDS: dict[type, str] = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
 
 
-def _write_lists(out, names, scenes, settings):
+def _write_lists(
+    out: Path, names: Sequence[str], scenes: dict[str, dict[str, Any]], settings: Settings
+) -> dict[str, Any]:
     skipped = {
         file.stem: _of_kind(checked_json(file), "reason", str, file)
         for file in sorted((out / SKIPPED).glob("*.json"))
@@ -369,7 +374,7 @@ def write_video(folder: Path, name: str, subject: Subject, body: FileBody, setti
     _write(folder, name, content, body, settings)
 
 
-def _photos(subject, views, size):
+def _photos(subject: Subject, views: Int[np.ndarray, " n"], size: int) -> list[Photo | Exception]:
     """Photos or, in their place, what is wrong with one."""
     import concurrent.futures
 
@@ -400,14 +405,14 @@ class Content:
     known: dict[str, Any]
 
 
-def _write(folder, name, content, body, settings):
+def _write(folder: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
     write = _write_scene if settings.layout == "scenes" else _write_capture
     replace_folder(
         folder, lambda temporary: write(temporary, folder, name, content, body, settings), mark=settings.mark
     )
 
 
-def _write_images(folder, view):
+def _write_images(folder: Path, view: View) -> tuple[str, ...]:
     """Their paths relative to the folder."""
     paths = tuple(f"{kind}/{view.name}.png" for kind in ("images", "masks"))
     for path, pixels in zip(paths, (view.image, view.mask), strict=True):
@@ -416,7 +421,7 @@ def _write_images(folder, view):
     return paths
 
 
-def _write_scene(folder, target, name, content, body, settings):
+def _write_scene(folder: Path, target: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
     (folder / "smpl").mkdir(parents=True)
     arrays = []
     for posed in content.posed:
@@ -437,7 +442,7 @@ def _write_scene(folder, target, name, content, body, settings):
     write_json(folder / SCENE, {"entry": entry, "known": known}, indent=None)
 
 
-def _write_capture(folder, target, name, content, body, settings):
+def _write_capture(folder: Path, target: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
     """In metres; the poses are those of the aligned world."""
     folder.mkdir()
     matrix = content.transform.copy()

@@ -12,6 +12,7 @@ d < 0 means that the body pokes out of its clothes, and counts in full. Hands ar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
@@ -203,7 +204,7 @@ def one_sided(away: Float[Array, " r"], outside: Float[Array, " r"], inside: Flo
     return away / jnp.where(away > 0, outside, inside)
 
 
-def _height(problem, betas):
+def _height(problem: ScanProblem, betas: Float[Array, " s"]) -> Float[Array, ""]:
     points = problem.surface.points
     height = lambda i: points.rest[i, 1] + jnp.dot(points.directions[i, 1, : betas.shape[0]], betas, precision=EXACT)
     top, bottom = (height(i) for i in problem.ends)
@@ -269,17 +270,19 @@ class Target:
         away = np.einsum("ra,ra->r", normals, points - vertices[rows])
         return away[weights > 0], float((weights > 0).mean())
 
-    def _posed(self, problem, state):
+    def _posed(
+        self, problem: ScanProblem, state: FitState
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Vertices (n, 3) in units of the frame and normals (n, 3)."""
         vertices, normals = pose_surface(problem.surface, *problem.body(state))
         return np.asarray(vertices, np.float64) / float(scale_of(state)), np.asarray(normals, np.float64)
 
 
-def _tree(points, normals):
-    from scipy.spatial import KDTree
-
+def _tree(points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> KDTree:
     return KDTree(np.concatenate([points, normals], axis=1))
 
 
-def _nearest(tree, points, normals):
+def _nearest(
+    tree: KDTree, points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]
+) -> Int[np.ndarray, " r"]:
     return tree.query(np.concatenate([points, normals], axis=1))[1]

@@ -93,7 +93,9 @@ def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: C
 
 
 @jax.jit
-def _look(vertices, faces, camera):
+def _look(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
+) -> tuple[Float[Array, "n 2"], Float[Array, " n"], Float[Array, "n 2"], Bool[Array, "h w"]]:
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
@@ -151,13 +153,13 @@ def inside_image(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -
     return np.all((positions > BORDER) & (positions < size - BORDER), axis=-1)
 
 
-def _covered(covered, positions):
+def _covered(covered: Bool[np.ndarray, "h w"], positions: Float[np.ndarray, "p 2"]) -> Bool[np.ndarray, " p"]:
     column, row = np.floor(positions).astype(int).T
     height, width = covered.shape
     return covered[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
-def _spread(lengths, count):
+def _spread(lengths: Float[np.ndarray, " l"], count: int) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Points evenly along pieces of a line: (count,) the piece of each and its position there in [0, 1]; none without length."""
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
@@ -167,7 +169,7 @@ def _spread(lengths, count):
     return piece, 1 - (ends[piece] - places) / lengths[piece]
 
 
-def _unit(vectors):
+def _unit(vectors: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
@@ -210,11 +212,15 @@ def match(body: Boundary, view: MaskView, reach: float, count: int) -> Matches:
     return Matches(jnp.asarray(points, jnp.int32), to(normals), to(offsets), to(weights))
 
 
-def _ends_of_mask(body, mask, reach):
+Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
+"""Points of the body's silhouette, and the normals and offsets of their lines."""
+
+
+def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) -> Pairs:
     """For points of the body, along their normals: where the mask goes from inside to outside."""
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
-    covered = np.asarray(_coverage(mask, places))
+    covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
     seen = inside_image(places, mask.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
     nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
@@ -227,11 +233,11 @@ def _ends_of_mask(body, mask, reach):
 
 
 @jax.jit
-def _coverage(mask, places):
+def _coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
     return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
 
 
-def _nearest(body, mask, reach):
+def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
     """For points of the mask: the nearest of the body that faces the same way."""
     if not len(body.positions) or not len(mask.positions):
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
@@ -281,7 +287,9 @@ def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int,
 
 
 @functools.partial(jax.jit, static_argnames="coefficients")
-def _between(body, ends, shares, coefficients):
+def _between(
+    body: BodyModel, ends: Int[Array, "v p 2"], shares: Float[Array, "v p"], coefficients: int
+) -> SurfacePoints:
     def one(ends, shares):
         def of(values):
             share = shares.reshape(-1, *(1,) * (values.ndim - 1))
