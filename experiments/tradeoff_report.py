@@ -185,10 +185,11 @@ def tune_budgets(run: Run, load: int | None = None, runs: int = 10, size: int = 
         fastest = tuning.measure(tuning.load_front()[0].settings, *network, capture, size)
         for make, frame in MULTIPLES:
             budget = tuning.Budget(make * fastest.reconstruct_ms, frame * fastest.frame_ms)
-            row: dict[str, Any] = {"reconstruct_ms": budget.reconstruct_ms, "frame_ms": budget.frame_ms}
+            most = {"reconstruct_ms": budget.reconstruct_ms, "frame_ms": budget.frame_ms}
+            row: dict[str, Any] = dict(most)
             rows.append(row)
             try:
-                tuned = tuning.tune(*network, capture, budget, size)
+                tuned = tuning.tune(*network, capture, size=size, **most)  # ty: ignore[invalid-argument-type]
             except tuning.NoSettingError as error:
                 row["refused"] = str(error)
                 continue

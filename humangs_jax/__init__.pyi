@@ -10,7 +10,7 @@ from .avatar.reconstruct import stack_captures as stack_captures
 from .data.motion import load_motion as load_motion
 
 # bodies
-from .body.model import BodyModel as BodyModel, BodyPose as BodyPose, rest_pose as rest_pose
+from .body.model import BodyModel as BodyModel, BodyPose as BodyPose
 from .body.library import load_body as load_body
 
 # photos -> avatar
@@ -24,7 +24,6 @@ from .apps.settings import reconstruct_with as reconstruct_with
 from .apps.settings import Settings as Settings
 from .apps.settings import PRESETS as PRESETS
 from .apps.settings import tune as tune
-from .apps.settings import Budget as Budget
 
 # avatar -> poses, videos, files
 from .avatar.avatar import Avatar as Avatar
@@ -49,6 +48,7 @@ from .network.humangs import init_humangs as init_humangs
 from .network.weights import save_weights as save_weights
 from .training.config import TrainConfig as TrainConfig
 from .training.loop import train as train
+from .training.ablation import ablate as ablate
 from .core.configuration import vary as vary
 from .evaluation.run import evaluate as evaluate
 

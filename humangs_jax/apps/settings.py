@@ -310,19 +310,40 @@ def tune(
     variables: Variables,
     config: HumanGSConfig,
     capture: Capture,
-    budget: Budget,
+    *,
+    reconstruct_ms: float | None = None,
+    frame_ms: float | None = None,
+    memory_mb: float | None = None,
     size: int = 512,
     front: Sequence[FrontPoint] | None = None,
     progress: bool = False,
 ) -> Tuned:
-    """The best settings of the front within a budget, for a capture and frames of `size` pixels.
+    """The best settings within a budget, measured on this machine with this person.
 
-    Arguments: front: points to choose from; None: `load_front`. Those that ask for more photos than the capture has are
-    tried with all it has. progress: show a bar.
+    Args:
+        variables: of the network, with `config`: `load_weights`.
+        config: see `variables`.
+        capture: whom to reconstruct.
+        reconstruct_ms: the most that making the avatar may take, with refinement, milliseconds.
+        frame_ms: the most that a frame may take, milliseconds.
+        memory_mb: the most memory that this may add to the process, MiB.
+        size: side of the frames, pixels.
+        front: points to choose from; None: those that come with the package. Those that ask for more photos than the capture has
+            are tried with all it has.
+        progress: show a bar.
 
-    Raises: NoSettingError if none is, saying what the cheapest takes; ValueError if memory is limited where it cannot be
-    measured.
+    Returns:
+        The settings (`.point.settings`, for `reconstruct_with`) and what they cost.
+
+    Raises:
+        NoSettingError: if no setting is within the budget; it says what the cheapest takes.
+        ValueError: if memory is limited where it cannot be measured.
+
+    Example:
+        tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
+        avatar = hg.reconstruct_with(tuned.point.settings, *hg.load_weights(), capture)
     """
+    budget = Budget(reconstruct_ms, frame_ms, memory_mb)
     front = usable(load_front() if front is None else front, capture)
     measured: dict[str, Cost] = {}
     confirmed = set()

@@ -451,7 +451,7 @@ class Tune:
         front, budget = usable(load_front(), photos), Budget(**budgets)
         best = max(front, key=lambda point: point.quality)
         with stage("measuring"):
-            tuned = tune(variables, config, photos, budget, self.size, front, progress=True)
+            tuned = tune(variables, config, photos, **budgets, size=self.size, front=front, progress=True)
         with stage("drawing both"):
             image = both_avatars(variables, config, photos, tuned.point, best, self.size)
         write_tuned(self.out, image, tuned, budget, self.size)

@@ -148,7 +148,7 @@ def test_a_choice_that_is_slower_the_second_time_is_not_taken(monkeypatch):
     monkeypatch.setattr(tuning, "measure", measure)
     capture = object.__new__(Capture)  # nothing of it is measured
     object.__setattr__(capture, "masks", ())
-    tuned = tune({}, presets.tiny(), capture, Budget(100.0), 32, [fast, good])
+    tuned = tune({}, presets.tiny(), capture, reconstruct_ms=100.0, size=32, front=[fast, good])
     assert tuned.point is fast and tuned.cost == Cost(31.0, 0.0, 10.0) and not any(times.values())
     assert tuned.measured["b"].reconstruct_ms == 90
 
@@ -224,7 +224,9 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
             "refined", Settings(runtime=small, refine_iterations=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0
         ),
     ]
-    assert tune(variables, config, capture, Budget(1e8, 1e8), 32, front).point.name == "refined"
+    assert (
+        tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front).point.name == "refined"
+    )
     monkeypatch.setattr(tuning, "load_front", lambda: front)
     command = ("tune", "someone", "--weights", "tiny.safetensors", "--size", "32", "--out", "tuned.json")
 
