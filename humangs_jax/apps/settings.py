@@ -135,10 +135,21 @@ def reconstruct_with(
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
 
-    Arguments: settings: or the name of one of `PRESETS`. config: of the weights; its runtime is replaced by that of the
-    settings. capture: `Settings.photos` are used. progress: show the bar of refinement.
+    Args:
+        settings: of speed against accuracy, or the name of one of `PRESETS`.
+        variables: of the network; with `config`, what `load_weights` returns.
+        config: of the weights; its runtime is replaced by that of the settings.
+        capture: `Settings.photos` of it are used.
+        progress: show the bar of refinement.
 
-    Raises: ValueError as `reconstruct` and `refine`.
+    Returns:
+        The avatar.
+
+    Raises:
+        ValueError: as `reconstruct` and `refine`.
+
+    Example:
+        avatar = hg.reconstruct_with("quality", *hg.load_weights(), capture)
     """
     if isinstance(settings, str):
         if settings not in PRESETS:

@@ -24,9 +24,18 @@ from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values
 
 @checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """Posed Gaussians, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
+    """The avatar in a pose, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
 
-    Colors stay, or are those of the avatar's light.
+    Args:
+        avatar: one person.
+        pose: rotations (j, 3), axis-angle; translation (3,), metres.
+
+    Returns:
+        Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a light.
+
+    Example:
+        loss = lambda pose: jnp.mean((hg.render(hg.skin(avatar, pose), camera, config).rgb - photo) ** 2)
+        gradient = jax.grad(loss)(pose)
     """
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
@@ -37,12 +46,24 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 @checked_arguments
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """Posed Gaussians that means, quats and scales describe completely (the linear deformation is factored into them).
+    """The avatar in a pose, as Gaussians that means, quats and scales describe completely.
 
-    The factors are not differentiable where two scales coincide: optimise through `skin`.
+    The linear deformation is factored into quaternions and scales. These are not differentiable where two scales coincide:
+    optimise through `skin`.
 
-    Raises: ValueError if the pose has another number of joints than the avatar; outside of transformations, also for values
-    that are not finite or out of range, naming the array.
+    Args:
+        avatar: one person.
+        pose: rotations (j, 3), axis-angle; translation (3,), metres.
+
+    Returns:
+        Posed Gaussians, metres.
+
+    Raises:
+        ValueError: if the pose has another number of joints than the avatar; outside of transformations, also for values
+            that are not finite or out of range, naming the array.
+
+    Example:
+        image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
     """
     joints = len(avatar.parents)
     if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):

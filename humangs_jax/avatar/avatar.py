@@ -44,22 +44,30 @@ class Avatar(Batchable):
     Or a batch of people, leading axes on every array: it can be indexed and iterated over, and functions are mapped over it with
     `jax.vmap`.
 
-    gaussians: canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some.
-    skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the shaped body in the T-pose. faces:
-    (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the splatting that the Gaussians were
-    trained for, a name in `SPLAT_PRESETS`. light: of the photos, where it has been estimated; other poses are drawn in it.
+    Example:
+        avatar = hg.Avatar.load("avatar.npz")
+        image = hg.render(hg.animate(avatar, pose), camera).rgb
     """
 
     gaussians: Gaussians
+    """Canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some."""
     skinning_weights: Float[Array, "g j"]
+    """Rows sum to 1."""
     rest_vertices: Float[Array, "n 3"]
+    """The shaped body in the T-pose, metres."""
     rest_joints: Float[Array, "j 3"]
+    """Its joints, metres."""
     faces: Int[Array, "f 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
     parents: tuple[int, ...] = static_field()
+    """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field()
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
+    """Whether Gaussians take the full linear part of the blended transform, or its rotation."""
     rendering: Literal["exact", "inria"] = static_field(default="exact")
+    """The splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`."""
     light: Light | None = None
+    """Of the photos, where it has been estimated; other poses are drawn in it."""
     one_at_a_time: ClassVar[bool] = True
 
     @property

@@ -51,16 +51,27 @@ SMALLEST_VOLUME = 0.2
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
-    The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
-    want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
-    its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
-    correction of a frame. Worlds that are not y-up are turned for the network (`data.views.upright`); the
-    avatar then has no light, whose directions would be those of another world. Views whose mask does not show the person are left
-    out (`data.usable_views`), and the exposure of the others is made equal (`data.exposure`). With `Runtime.displacement` the
-    body is displaced to the masks first (`data.displacement`); the avatar keeps that.
+    Photos are brought to the network's image size, their exposure is made equal, and views whose mask does not show the person
+    are left out. Numbers of views and of foreground tokens are rounded up to few sizes, each with a program of its own.
 
-    Raises: ValueError if the network makes no Gaussians, the capture has no view, none that shows the person, or values that are
-    not finite or out of range, naming the array.
+    Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
+    another world. With `Runtime.displacement` the body is displaced to the masks first. For a network with a driver this is the
+    avatar before any correction of a frame.
+
+    Args:
+        variables: of the network; with `config`, what `load_weights` returns.
+        config: of the network.
+        capture: photos, cameras, poses, and masks if there are some.
+
+    Returns:
+        The avatar in the T-pose of the person's own shape.
+
+    Raises:
+        ValueError: if the network makes no Gaussians, the capture has no view, none that shows the person, or values that
+            are not finite or out of range, naming the array.
+
+    Example:
+        avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
@@ -80,8 +91,20 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
 
     A batch keeps an accelerator busy that one person does not; on a CPU it takes as long as one person after the other.
 
-    Raises: ValueError if there is no capture, one has no view or values that are not finite or out of range, or their bodies
-    differ (their shapes may).
+    Args:
+        variables: of the network; with `config`, what `load_weights` returns.
+        config: of the network.
+        captures: of people with one body model; their shapes may differ.
+
+    Returns:
+        An avatar for each capture.
+
+    Raises:
+        ValueError: if there is no capture, one has no view or values that are not finite or out of range, or their bodies
+            differ.
+
+    Example:
+        avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
     """
     body, views, config, turned = _stacked(config, captures)
     avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
@@ -90,17 +113,24 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
 
 @checked_arguments
 def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """What several people are reconstructed from in one program of your own: body, views, configuration.
+    """What several people are reconstructed from in one program of your own.
 
-        body, views, config = stack_captures(config, captures)
-        batched = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))
-        avatars, dropped = batched(variables, config, body, views)    # `reconstruct_batch`, as one batch of avatars
+    Args:
+        config: of the network.
+        captures: of people with one body model.
 
-    Returns the body that carries the Gaussians; the photos as the network wants them (leading axis b, padded to the largest
-    number of views); `config` with room for as many tokens as these photos need.
+    Returns:
+        The body that carries the Gaussians; the photos as the network wants them (leading axis b, padded to the largest
+        number of views); `config` with room for as many tokens as these photos need.
 
-    Raises: ValueError as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the avatars are to have the
-    light of their photos: in a batch all have one or none has.
+    Raises:
+        ValueError: as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the avatars are to have the
+            light of their photos: in a batch all have one or none has.
+
+    Example:
+        body, views, config = hg.stack_captures(config, captures)
+        batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
+        avatars, dropped = batched(variables, config, body, views)  # `reconstruct_batch`, as one batch
     """
     body, views, config, turned = _stacked(config, captures)
     if config.conventions.light and any(turned):
@@ -167,13 +197,25 @@ def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
 def reconstruct_views(
     variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
-    not fit into `config.runtime.token_capacity`.
+    """The pure function behind `reconstruct`: one subject's views to an avatar. Batch it with `jax.vmap`.
 
-    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`; `stack_captures` makes the arguments.
-    Weights files record no token capacity, and the default has room for all patches, which takes the time of all.
+    Weights files record no token capacity, and the default has room for all patches, which takes the time of all;
+    `stack_captures` sizes it.
 
-    Raises: ValueError if the body is not one of `gaussian_body` for this configuration, or the photos are not of its size.
+    Args:
+        variables: of the network; with `config`, what `load_weights` returns.
+        config: of the network.
+        body: the body that carries the Gaussians, of `stack_captures`.
+        views: photos at the network's size, cameras and poses, of `stack_captures`.
+
+    Returns:
+        The avatar, and how many foreground patches did not fit into `config.runtime.token_capacity`.
+
+    Raises:
+        ValueError: if the body is not the one that this configuration wants, or the photos are not of its size.
+
+    Example:
+        avatars, dropped = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
     """
     made = "body, views, config = stack_captures(config, captures) makes what it wants"
     (height, width), side = views.images.shape[1:3], config.image_size

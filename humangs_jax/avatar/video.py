@@ -63,15 +63,29 @@ def check_video(path: str | Path, frames: int, width: int, height: int, transpar
 def write_video(
     path: str | Path, frames: Float[np.ndarray, "m h w c"] | Iterable[Float[np.ndarray, "h w c"]], fps: float | int
 ) -> int:
-    """Write frames in [0, 1], (h, w, 3) or with straight alpha (h, w, 4); returns their number.
+    """Write frames as a video or as PNG files; all appears at the end, or nothing does.
 
-    The suffix decides: .mp4, .webm, .gif; none: a folder of frame_00000.png and so on, which replace those that are there.
-    All appears at the end or nothing does. Frames are asked for one by one: a .gif keeps one byte a channel of all in memory,
-    the others none. Video codecs want even sides: odd ones get one more row or column, a copy of the last. A GIF of more than
-    50 frames a second leaves out frames to keep its speed. Only .webm and PNG files have alpha.
+    Frames are asked for one by one: a .gif keeps one byte a channel of all in memory, the others none. Video codecs want even
+    sides: odd ones get one more row or column, a copy of the last. A GIF of more than 50 frames a second leaves out frames to
+    keep its speed.
 
-    Raises: ValueError if there is no frame, they differ in size, a number is not finite, `fps` is not positive, the suffix is
-    another one or has no alpha; OSError if the file cannot be written; what `frames` raises.
+    Args:
+        path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which replace those that are
+            there.
+        frames: (h, w, 3) in [0, 1], or with straight alpha (h, w, 4), which only .webm and PNG files have.
+        fps: frames per second.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ValueError: if there is no frame, they differ in size, a number is not finite, `fps` is not positive, or the suffix
+            is another one or has no alpha.
+        OSError: if the file cannot be written; also what `frames` raises.
+
+    Example:
+        images = (hg.render(hg.animate(avatar, pose), camera).rgb for pose in poses)
+        hg.write_video("dance.mp4", map(np.asarray, images), fps=30)
     """
     path = Path(path)
     if not (np.isfinite(fps) and fps > 0):

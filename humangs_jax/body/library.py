@@ -32,14 +32,23 @@ KEYS = {
 
 @checked_arguments
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
-    """A body model.
+    """A body model: the CC0 body that comes with the package, or one of a file.
 
-    Arguments: path: None for the CC0 body shipped with the package (13,380 vertices, 55 joints in SMPL-X order, the
-    person faces +z, pelvis at (0, -0.35, 0)); a file of `save_body`; or an SMPL-X model file (.npz or
-    .pkl).
-    smplx_options: for SMPL-X files only, see `humangs_jax.body.smplx.load_smplx`.
-    Raises: FileNotFoundError; ValueError, naming file and key, for what cannot be read; TypeError for options of SMPL-X
-    files given with another body.
+    Args:
+        path: None for the shipped body (13,380 vertices, 55 joints in SMPL-X order, facing +z, pelvis at (0, -0.35, 0)); a
+            file of `save_body`; or an SMPL-X model file (.npz or .pkl).
+        **smplx_options: for SMPL-X files only, see `humangs_jax.body.smplx.load_smplx`.
+
+    Returns:
+        The model.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: naming file and key, for what cannot be read.
+        TypeError: for options of SMPL-X files given with another body.
+
+    Example:
+        body = hg.load_body("SMPLX_NEUTRAL.npz")
     """
     if path is None:
         if smplx_options:

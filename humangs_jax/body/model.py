@@ -40,50 +40,49 @@ class Texels:
 
 @pytree_dataclass
 class BodyModel:
-    """An articulated, shapeable triangle mesh.
-
-    template: (n, 3) mean T-pose, metres.
-    shape_directions: (n, 3, s) metres per unit of a shape coefficient; names in `shape_names`.
-    pose_directions: (n, 3, q) or None; q = 9 (j - 1) entries of R_j - I, row-major, joints 1 and up.
-    joint_regressor: (j, n) joints from rest vertices; rows sum to 1.
-    skinning_weights: (n, j) non-negative, rows sum to 1.
-    faces: (f, 3) vertex indices, counter-clockwise seen from outside.
-    uvs, uv_faces: (u, 2) texture coordinates (v up) and (f, 3) indices into them, or None.
-    collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.resolution`.
-    spacing: (n,) or None: distance to neighbouring vertices relative to the mesh that was subdivided, see `body.subdivision`.
-    texels: a map of the surface for networks that work on one, see `network.parts`; or None.
-    parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static. made_for: static, what
-    `data.views.gaussian_body` has made it for; None: a body as it was read.
-    """
+    """An articulated, shapeable triangle mesh: SMPL-X, or the body that comes with the package."""
 
     template: Float[Array, "n 3"]
+    """Mean T-pose, metres."""
     shape_directions: Float[Array, "n 3 s"]
+    """Metres per unit of a shape coefficient."""
     pose_directions: Float[Array, "n 3 q"] | None
+    """Metres; q = 9 (j - 1) entries of R_j - I, row-major, joints 1 and up."""
     joint_regressor: Float[Array, "j n"]
+    """Joints from rest vertices; rows sum to 1."""
     skinning_weights: Float[Array, "n j"]
+    """Non-negative, rows sum to 1."""
     faces: Int[Array, "f 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
     uvs: Float[Array, "u 2"] | None = None
+    """Texture coordinates, v up."""
     uv_faces: Int[Array, "f 3"] | None = None
+    """Indices into `uvs`."""
     collapse_order: Int[Array, " n"] | None = None
+    """Of progressive decimation, with `collapse_into`: `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
     spacing: Float[Array, " n"] | None = None
+    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.subdivision`."""
     texels: Texels | None = None
+    """A map of the surface, for networks that work on one: `network.parts`."""
     parents: tuple[int, ...] = static_field(default=())
+    """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
     shape_names: tuple[str, ...] = static_field(default=())
+    """Of the shape directions."""
     name: str = static_field(default="body")
     made_for: tuple | None = static_field(default=None)
+    """What `data.views.gaussian_body` has made it for; None: a body as it was read."""
 
 
 @pytree_dataclass
 class BodyPose(Batchable):
-    """A pose.
-
-    rotations: (j, 3) axis-angle of each joint relative to its parent, radians. translation: (3,) metres, applied last.
-    """
+    """A pose, or a batch of poses."""
 
     rotations: Float[Array, "j 3"]
+    """Axis-angle of each joint relative to its parent, radians."""
     translation: Float[Array, "3"]
+    """Metres, applied last."""
 
 
 @pytree_dataclass

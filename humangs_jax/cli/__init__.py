@@ -139,8 +139,10 @@ def _parsed(arguments: list[str]) -> Command:
 
     Raises: SystemExit after --help, or for options that tyro refuses; UsageError for an unknown command.
     """
+    from humangs_jax.core.progress import say
+
     if not arguments or arguments[0] in ("--help", "-h"):
-        print(overview())
+        say(overview())
         raise SystemExit(0 if arguments else BAD_USAGE)
     import tyro
 
@@ -160,7 +162,7 @@ def _parsed(arguments: list[str]) -> Command:
         return tyro.cli(command, prog=prog, args=options, config=(tyro.conf.FlagCreatePairsOff,))
     except SystemExit as end:
         if not end.code:
-            print("examples:", *(f"  {example}" for example in command.examples), sep="\n")
+            say("\n".join(["examples:", *(f"  {example}" for example in command.examples)]))
         raise
 
 

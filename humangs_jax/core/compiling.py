@@ -20,15 +20,22 @@ LARGEST = 2 << 30
 
 
 def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None:
-    """Turns on JAX's persistent compilation cache, in a folder of its own for each version of JAX and kind of processor.
+    """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of processor.
 
-    Programs call it once, before the first computation; the library never does. Where JAX is not imported yet, it is not
-    imported here: it finds the folder in its environment variable, as do the programs that this one starts.
+    Programs call it once, before the first computation; the library never does. JAX is not imported here: it finds the folder
+    in its environment variable, as do the programs that this one starts. A cache that JAX already has
+    (`JAX_COMPILATION_CACHE_DIR`) stays.
 
-    Arguments: folder: where the cache lies; None: what the environment variable `HUMANGS_COMPILE_CACHE` names, else
-    `humangs_jax` in the user's cache folder (`XDG_CACHE_HOME`, or what the platform has in its place).
-    Returns: the folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
-    cannot be written to is not an error. A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays.
+    Args:
+        folder: where the cache lies. None: what the environment variable `HUMANGS_COMPILE_CACHE` names, else `humangs_jax`
+            in the user's cache folder (`XDG_CACHE_HOME`, or what the platform has in its place).
+
+    Returns:
+        The folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
+        cannot be written to is not an error.
+
+    Example:
+        hg.enable_compile_cache()
     """
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
@@ -96,7 +103,16 @@ Eager calls use it; your own jitted functions need it themselves. Works from jax
 
 
 def compiler_options() -> dict[str, Any] | None:
-    """`CPU_COMPILER_OPTIONS` if the default backend is the CPU, else None. Call it late: asking for the backend starts it."""
+    """Options for `jax.jit` that make programs like these faster on CPUs.
+
+    Call it late: asking for the backend starts it.
+
+    Returns:
+        `CPU_COMPILER_OPTIONS` if the default backend is the CPU, else None.
+
+    Example:
+        step = jax.jit(step, compiler_options=hg.compiler_options())
+    """
     import jax
 
     return CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None

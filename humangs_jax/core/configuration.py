@@ -221,10 +221,20 @@ def part(cls: type[T]) -> type[T]:
 
 
 def vary(config: T, changes: Mapping[str, Any]) -> T:
-    """A configuration with fields exchanged, each named by its path: an ablation in one line.
+    """A configuration with fields exchanged, each named by its path.
 
-    Example: `hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})`.
-    Raises: ValueError naming the path, for a field that does not exist, and as the configuration's own checks.
+    Args:
+        config: a frozen dataclass.
+        changes: new values by path.
+
+    Returns:
+        The changed copy.
+
+    Raises:
+        ValueError: naming the path, for a field that does not exist, and as the configuration's own checks.
+
+    Example:
+        hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})
     """
     for path, value in changes.items():
         config = _varied(config, path.split("."), value, path)

@@ -181,7 +181,21 @@ def _annotated_axes(cls: Any) -> dict[str, list[Any] | None]:
 
 
 def replace(tree: T, **changes: Any) -> T:
-    """A copy with some fields exchanged, without shape checks, so that it also works on batched trees."""
+    """A copy of a pytree with some fields exchanged, without checks of shapes, so that it works on batches, too.
+
+    Args:
+        tree: an instance of a dataclass.
+        **changes: new values by field.
+
+    Returns:
+        The changed copy.
+
+    Raises:
+        TypeError: for a name that is no field.
+
+    Example:
+        grey = hg.replace(gaussians, colors=jnp.full_like(gaussians.colors, 0.5))
+    """
     names = {f.name for f in dataclasses.fields(tree)}  # ty: ignore[invalid-argument-type]
     if unknown := set(changes) - names:
         raise TypeError(f"{type(tree).__name__} has no field {sorted(unknown)}; its fields are {sorted(names)}")

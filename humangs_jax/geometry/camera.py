@@ -30,13 +30,18 @@ class Camera(Batchable):
 
     A batch can be indexed and iterated over: `for camera in cameras`.
 
-    K: (3, 3) intrinsics in pixels. cam_from_world: (4, 4) rigid. width, height: pixels, static.
+    Example:
+        camera = hg.Camera.from_opencv(K, cam_from_world, width=512, height=512)
     """
 
     K: Matrix3
+    """Intrinsics, pixels."""
     cam_from_world: Matrix4
+    """Rigid, metres; OpenCV: x right, y down, z forward."""
     width: int = static_field()
+    """Pixels."""
     height: int = static_field()
+    """Pixels."""
 
     @classmethod
     def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
@@ -142,7 +147,22 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
 
 @checked_arguments
 def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int) -> Camera:
-    """A camera at `eye` whose axis passes through `target`, image up along `up` (which may not be parallel to the axis)."""
+    """A camera that looks at a point.
+
+    Args:
+        eye: (3,) the camera's centre, metres.
+        target: (3,) what its axis passes through.
+        up: (3,) what is up in the image; not parallel to the axis.
+        K: (3, 3) intrinsics, pixels.
+        width: pixels.
+        height: pixels.
+
+    Returns:
+        One camera.
+
+    Example:
+        camera = hg.look_at(jnp.array([0.0, 1.0, 3.0]), jnp.array([0.0, 0.9, 0.0]), jnp.array([0.0, 1.0, 0.0]), K, 512, 512)
+    """
     forward = safe_normalize(target - eye, jnp.asarray([0.0, 0.0, 1.0]))
     right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
     down = jnp.cross(forward, right)
@@ -160,9 +180,25 @@ def orbit(
     width: int,
     height: int,
 ) -> Camera:
-    """A batch of cameras on circles around `target`, y up; azimuth 0 stands at +z, angles in radians.
+    """Cameras on circles around a point, y up; azimuth 0 stands at +z.
 
-    Raises: ValueError for elevations beyond a right angle.
+    Args:
+        target: (3,) what they look at, metres.
+        distance: metres, for all or (v,).
+        azimuths: (v,) radians.
+        elevations: radians above the horizon, for all or (v,).
+        K: (3, 3) intrinsics, pixels.
+        width: pixels.
+        height: pixels.
+
+    Returns:
+        A batch of v cameras.
+
+    Raises:
+        ValueError: for elevations beyond a right angle.
+
+    Example:
+        cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):

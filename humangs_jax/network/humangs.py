@@ -104,9 +104,18 @@ def intermediates(variables: Variables, inputs: HumanGSInputs, config: HumanGSCo
 @jax.jit
 @checked_arguments
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
-    """Fresh variables {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}, float32.
+    """Fresh variables of a network, float32.
 
-    A part without parameters or running statistics is absent.
+    Args:
+        key: of JAX's random numbers.
+        config: of the network.
+
+    Returns:
+        {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}; a part without parameters or
+        running statistics is absent.
+
+    Example:
+        variables = hg.init_humangs(jax.random.key(0), config)
     """
     run, parts = config.run(), config.architecture
     encoder_key, decoder_key = jax.random.split(key)

@@ -47,9 +47,19 @@ def save_weights(
     config: HumanGSConfig,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Write the variables; the file appears whole or not at all.
+    """Write variables and configuration; the file appears whole or not at all.
 
-    Raises: ValueError if a tensor does not fit the configuration, is not finite, or overflows float16, naming its key.
+    Args:
+        path: the .safetensors file to write or replace.
+        variables: of the network.
+        config: of the network; its `Runtime` is not written.
+        dtype: of the stored numbers; float16 halves the file.
+
+    Raises:
+        ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or overflows float16.
+
+    Example:
+        hg.save_weights("mine.safetensors", variables, config, "float16")
     """
     from safetensors.numpy import save
 
@@ -66,10 +76,21 @@ def save_weights(
 
 @checked_arguments
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
-    """Variables (float32) and configuration of a file, with default `Runtime`; None loads the weights of this package.
+    """Variables (float32) and configuration of a weights file, with default `Runtime`.
 
-    Raises: FileNotFoundError; ValueError if the file is not a weights file of this package, or a tensor is missing, unknown, of
-    the wrong shape or not finite, naming file and key; or if the contents are not those of the checksum.
+    Args:
+        path: a .safetensors file of this package. None: the shipped weights.
+
+    Returns:
+        The variables for `reconstruct`, and the network's configuration.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: naming file and key: no weights file of this package; a tensor is missing, unknown, of the wrong shape
+            or not finite; the contents are not those of the checksum.
+
+    Example:
+        variables, config = hg.load_weights()
     """
     if path is None:
         with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:

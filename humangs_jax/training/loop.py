@@ -82,9 +82,13 @@ def train(
 ) -> TrainState:
     """Train until `config.steps`, from the newest checkpoint in `out` if there is one, on all devices of all processes.
 
-    Arguments:
+    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C interrupts at once.
+
+    Args:
+        config: the run.
         body: the model that the captures' parameters belong to; made into the model's `gaussian_body` here.
         training: capture folders, or what makes another source of examples (`sources`).
+        out: folder of checkpoints, logs, sheets and weights.
         validation: the same of other people; no validation without.
         variables: where to start a new run, for instance shipped weights; None for fresh ones.
         networks: of the losses that need them.
@@ -92,11 +96,17 @@ def train(
         stop_at: end after this step as if interrupted.
         progress: show a progress bar.
 
-    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C interrupts at once.
+    Returns:
+        The last state.
 
-    Raises: TrainingInterrupted, a KeyboardInterrupt, as said; ValueError if `out` belongs to a run of another configuration, no
-    capture can be used, devices and batch do not divide each other, or the sizes of a later stage do not fit; OSError if another
-    process trains into `out`.
+    Raises:
+        TrainingInterrupted: a KeyboardInterrupt, as said.
+        ValueError: if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
+            divide each other, or the sizes of a later stage do not fit.
+        OSError: if another process trains into `out`.
+
+    Example:
+        state = hg.train(config, hg.load_body(), ["people/0000001", "people/0000002"], "runs/mine")
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)

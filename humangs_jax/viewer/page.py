@@ -294,9 +294,21 @@ class NotebookPage:
 def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> NotebookPage:
     """The avatar in a notebook, moving: the last expression of a cell, or `display(hg.show(avatar))`.
 
-    Arguments: motion: None for the shipped walk. height: pixels. The page becomes a part of the notebook's file (some 1.2 MB).
+    The page becomes a part of the notebook's file (some 1.2 MB).
 
-    Raises: as `page_html`.
+    Args:
+        avatar: one person.
+        motion: None for the shipped walk.
+        height: pixels.
+
+    Returns:
+        What Jupyter displays.
+
+    Raises:
+        ValueError: as `page_html`.
+
+    Example:
+        hg.show(avatar, hg.load_motion("dance.bvh"))
     """
     return NotebookPage(page_html(avatar, motion), height)
 
