@@ -18,11 +18,9 @@ from experiments.results import markdown_table
 from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.sheets import contact_sheet
-from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyModel
+from humangs_jax.body.library import EXPRESSION_COLUMNS, SHAPE_COLUMNS, load_body
+from humangs_jax.body.model import JOINT_NAMES, BodyModel
 from humangs_jax.body.resolution import decimate
-from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body

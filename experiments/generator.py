@@ -12,9 +12,8 @@ from experiments.harness import Run, entry, figure
 from experiments.results import markdown_table
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.people import anatomy, cameras, rendering
-from humangs_jax.people.rendering import padded
-from humangs_jax.people.subject import describe, make_subject
+from humangs_jax.people import anatomy, cameras
+from humangs_jax.people.subject import describe, make_subject, padded, render_view
 from humangs_jax.people.writer import sample_pose
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
@@ -153,7 +152,7 @@ def look_at_all(body, options):
             for k in range(options.views):
                 counts += count_faults(body, posed, batch[k])
                 if pose == 0 and k == 0:
-                    image, mask = rendering.render_view(posed, batch[k])
+                    image, mask = render_view(posed, batch[k])
                     colors += _color_histogram(image[mask == 1])
                     shares.append(float(mask.mean()))
             rows.append(

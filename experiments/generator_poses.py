@@ -18,9 +18,8 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.people import anatomy as poses
 from humangs_jax.people.anatomy import LIMITS, Build, Rotations
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.rendering import pose_subject, render_view
 from humangs_jax.people.sequences import KINDS, sample_sequence
-from humangs_jax.people.subject import DEMO, make_subject
+from humangs_jax.people.subject import DEMO, make_subject, pose_subject, render_view
 from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 

@@ -22,8 +22,7 @@ from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_peo
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import to_uint8
 from humangs_jax.people.bank import bake_subject, lit_texture
-from humangs_jax.people.rendering import pose_subject, render_view
-from humangs_jax.people.subject import DEMO, describe, make_subject
+from humangs_jax.people.subject import DEMO, describe, make_subject, pose_subject, render_view
 from humangs_jax.people.writer import sample_motion, sample_pose
 
 SEEDS = (3_000_271, 3_000_584)

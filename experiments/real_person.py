@@ -39,7 +39,7 @@ from experiments.real_people import (
 )
 from experiments.results import markdown_table, write_json
 from experiments.subjects import shipped_digest
-from humangs_jax.apps.held_out import better_body
+from humangs_jax.apps.start import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body

@@ -24,8 +24,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
-from humangs_jax.evaluation.protocol import PROTOCOLS
-from humangs_jax.evaluation.scores import score_views
+from humangs_jax.evaluation.scores import PROTOCOLS, score_views
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
@@ -36,8 +35,7 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
-from humangs_jax.people.rendering import PosedSubject
-from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, seeds_of
+from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, SyntheticSubject, make_subject, seeds_of
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12

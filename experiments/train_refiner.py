@@ -36,7 +36,7 @@ from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import to_uint8
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import read_json
-from humangs_jax.losses.ssim import structural_dissimilarity
+from humangs_jax.losses.metrics import structural_dissimilarity
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example

@@ -14,16 +14,15 @@ from experiments.harness import Run, entry
 from experiments.paper.bench import PAINTED, PHOTOS, TARGETS, load_networks, measured, triple
 from experiments.results import markdown_table, significant, write_json
 from experiments.systems import SYSTEMS
+from humangs_jax.body.library import assemble_pose, load_hands, load_smplx
 from humangs_jax.body.model import pose_body, shape_body
-from humangs_jax.body.smplx import assemble_pose, load_hands, load_smplx
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import CaptureCache, ViewSampling
 from humangs_jax.data.loading.captures import find_captures, subject_order, view_generator
 from humangs_jax.data.loading.examples import draw_views
 from humangs_jax.evaluation.cases import draw_painted_body, find_people, painted_body
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.losses.metrics import masked_psnr, psnr
-from humangs_jax.losses.ssim import similarity_map
+from humangs_jax.losses.metrics import masked_psnr, psnr, similarity_map
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh

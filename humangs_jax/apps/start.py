@@ -1,18 +1,43 @@
 """From a folder of photos to an avatar: what is there, what is missing, and which well-known tool makes it.
 
-Nothing is asked: the folder is looked at. docs/your_photos.md shows the way.
+Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also the best frames of a video, and how like a
+person an avatar is where no photo was.
 """
 
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.calibration.photos import SUFFIXES, is_photo
+from humangs_jax.data.calibration.videos import (
+    LONGER_SIDE,
+    PHOTOS,
+    choose_frames,
+    find_videos,
+    grey_frames,
+    looked_at,
+    write_frames,
+)
 from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
+from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
+from humangs_jax.data.usable_views import usable_views
+from humangs_jax.data.views import cropped
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.scores import score
+from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_size, open_image
-from humangs_jax.io.reading import reading, walk
+from humangs_jax.io.reading import read_json, reading, walk, write_json
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.refine import refine
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
@@ -183,3 +208,133 @@ def _has_alpha(photo: Path) -> bool:
         if "A" not in image.getbands() and "transparency" not in image.info:
             return False
         return image.convert("RGBA").getchannel("A").getextrema()[0] < 255
+
+
+# Photos of a video ----------------------------------------------------------------------------------------------------
+
+
+MARK = "video.json"
+"""In the folder of photos: the video that they are of."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoPhotos:
+    """folder: of the photos. chosen: numbers of the frames, from 0. count: of all frames of the video."""
+
+    video: Path
+    folder: Path
+    chosen: tuple[int, ...]
+    count: int
+
+    def __str__(self) -> str:
+        frames = ", ".join(map(str, self.chosen))
+        return (
+            f"{self.video}: {len(self.chosen)} of {self.count:,} frames, sharp ones that show different things ({frames}), "
+            f"are the photos in {self.folder / 'images'}; what is to be added goes into {self.folder}"
+        )
+
+
+def video_of(place: Path) -> Path | None:
+    """The video that `place` is, or that is in a folder without photos; None if there is none.
+
+    Raises: CaptureError for several videos.
+    """
+    if not place.is_dir():
+        return place if place.is_file() and place.suffix.lower() in VIDEOS else None
+    videos = find_videos(place)
+    if not videos or next(find_photos(place), None) is not None:
+        return None
+    if len(videos) > 1:
+        problem = "expected photos or one video (videos of several cameras: `humangs import cameras`)"
+        raise CaptureError(place, "", f"{len(videos)} videos and no photo: {problem}")
+    return next(iter(videos.values()))
+
+
+def photos_of_video(video: Path, folder: Path) -> VideoPhotos:
+    """Write the chosen frames into `folder / "images"`; a folder that an earlier run wrote of this video stays as it is.
+
+    Raises: CaptureError naming the video, or the folder if something else is there.
+    """
+    with reading(video, "video", CaptureError):
+        status = video.stat()
+    of_video = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
+    if folder.exists() or folder.is_symlink():
+        known = read_json(folder / MARK) if (folder / MARK).is_file() else None
+        if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
+            problem = f"exists, and is not of {video.name} as it is now: expected another folder, or remove it"
+            raise CaptureError(folder, "", problem)
+        return VideoPhotos(video, folder, tuple(known["chosen"]), known["frames"])
+    sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
+    with reading(video, "video", CaptureError):
+        chosen = choose_frames(sharpness, thumbnails, PHOTOS)
+
+    def write(place: Path) -> None:
+        write_frames(video, place / "images", chosen)
+        write_json(place / MARK, {**of_video, "frames": len(sharpness), "chosen": chosen})
+
+    replace_folder(folder, write, mark=MARK)
+    return VideoPhotos(video, folder, tuple(chosen), len(sharpness))
+
+
+# A held-out photo -----------------------------------------------------------------------------------------------------
+
+
+LEAST_PHOTOS, SIZE = 4, 512
+LONGEST = 1024
+"""Pixels: larger photos are reduced, whose crops around the person would be all the same."""
+CLEARLY = 0.1
+"""Decibels by which a second body has to be better."""
+
+
+class HeldOut(NamedTuple):
+    """Of the photo with that name. psnr: dB over the person."""
+
+    name: str
+    psnr: float
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the foreground"
+
+
+def held_out_psnr(
+    variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
+) -> HeldOut | None:
+    """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
+    `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
+    second copy of the nearest photo: the programs for that number of photos are compiled already.
+    """
+    capture = usable_views(capture)
+    if max(capture.images.shape[1:3]) > LONGEST:
+        capture = capture.resized(LONGEST)
+    capture = equal_exposure(capture)
+    if capture.masks is None or capture.view_count < LEAST_PHOTOS:
+        return None
+    views = np.arange(capture.view_count)
+    apart = _distances(capture)
+    view = int(apart.min(axis=1).argmin())
+    others = capture.select(np.where(views == view, int(apart[view].argmin()), views))
+    avatar = reconstruct(variables, config, others)
+    if refinement is not None:
+        avatar = refine(avatar, others, refinement)
+    photo = cropped(capture.select([view]), SIZE)
+    return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg))
+
+
+def better_body(
+    variables: PyTree, config: HumanGSConfig, first: Capture, second: Capture, refinement: RefineConfig | None
+) -> tuple[Capture, HeldOut | None]:
+    """The capture whose body makes the better avatar, judged by a photo that is held out of it, and what that photo says.
+
+    More of the masks is covered by a body that fills clothes; the avatar is not better for it. Without enough photos the first.
+    """
+    one = held_out_psnr(variables, config, first, refinement)
+    two = None if one is None else held_out_psnr(variables, config, second, refinement)
+    return (second, two) if one is not None and two is not None and two.psnr > one.psnr + CLEARLY else (first, one)
+
+
+def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
+    """Between the cameras, seen from the person; a photo is none of its own neighbours."""
+    towards = np.asarray(capture.cameras.center) - np.asarray(capture.poses.translation)[np.asarray(capture.frames)]
+    towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    return np.linalg.norm(towards[:, None] - towards, axis=-1) + 9 * np.eye(len(towards))

@@ -11,8 +11,7 @@ import numpy as np
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.body.model import BodyPose, RestBody
-from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError

@@ -24,8 +24,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw, draw_gaussians, image_of, posed, splatting_of
 from humangs_jax.avatar.light import surface_normals, turned_normals
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.body.model import BodyPose
-from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar

@@ -14,8 +14,7 @@ import numpy as np
 from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
-from humangs_jax.body.model import BodyModel, BodyPose, RestBody
-from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
+from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
 from humangs_jax.core.array_types import Array, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace

@@ -30,10 +30,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body import skinning
-from humangs_jax.body.joints import FINGERS
-from humangs_jax.body.model import BodyModel, BodyPose, pose_features
-from humangs_jax.body.skinning import SurfacePoints, pose_points, shaped
+from humangs_jax.body.model import (
+    EXACT,
+    FINGERS,
+    BodyModel,
+    BodyPose,
+    SurfacePoints,
+    joint_transforms,
+    pose_features,
+    pose_points,
+    shaped,
+)
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
@@ -214,7 +221,7 @@ def landmark_model(
 
 def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
     """Values of the joints from those of the vertices (n, ...)."""
-    return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=skinning.EXACT)
+    return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
 def _surface_points(body: BodyModel, vertices: Int[np.ndarray, " p"]) -> SurfacePoints:
@@ -230,7 +237,7 @@ def _surface_points(body: BodyModel, vertices: Int[np.ndarray, " p"]) -> Surface
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
     """A joint as a point that it carries itself."""
     row = body.joint_regressor[joint : joint + 1]
-    product = lambda values: jnp.einsum("jn,n...->j...", row, values, precision=skinning.EXACT)
+    product = lambda values: jnp.einsum("jn,n...->j...", row, values, precision=EXACT)
     return SurfacePoints(
         product(body.template),
         product(body.shape_directions),
@@ -271,7 +278,7 @@ def pose_joints(
 ) -> tuple[Float[Array, "j 4 4"], Float[Array, "j 3"]]:
     """Transforms of the joints from rest, and where the joints are, metres."""
     rest = shaped(model.joints, model.joint_directions, betas)
-    transforms = skinning.joint_transforms(rest, model.parents, pose.rotations, pose.translation)
+    transforms = joint_transforms(rest, model.parents, pose.rotations, pose.translation)
     return transforms, transform.apply(transforms, rest)
 
 
@@ -279,7 +286,7 @@ def landmarks_from(
     model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
 ) -> Float[Array, "k 3"]:
     """Landmarks from posed joints and points."""
-    return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=skinning.EXACT)
+    return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=EXACT)
 
 
 def _movers(

@@ -14,8 +14,7 @@ from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 
 if TYPE_CHECKING:
-    from humangs_jax.apps.held_out import HeldOut
-    from humangs_jax.apps.start import Material
+    from humangs_jax.apps.start import HeldOut, Material
     from humangs_jax.data.calibration.importing import ImportReport
     from humangs_jax.data.capture import Capture
 
@@ -171,7 +170,7 @@ class Start:
 
     def _photos(self) -> Path:
         """The folder of photos; that of a video is beside --out."""
-        from humangs_jax.apps.video_photos import photos_of_video, video_of
+        from humangs_jax.apps.start import photos_of_video, video_of
 
         if (video := video_of(self.photos)) is None:
             return self.photos
@@ -226,7 +225,7 @@ class Start:
         """
         with stage("fitting the body"):
             from humangs_jax.apps.detect import MASKS
-            from humangs_jax.apps.held_out import better_body
+            from humangs_jax.apps.start import better_body
             from humangs_jax.body.library import load_body
             from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
@@ -304,7 +303,7 @@ class Start:
                 raise KeyboardInterrupt
         if estimate is None:
             with stage("holding one photo out"):
-                from humangs_jax.apps.held_out import held_out_psnr
+                from humangs_jax.apps.start import held_out_psnr
                 from humangs_jax.refinement.config import RefineConfig
 
                 estimate = held_out_psnr(

@@ -21,7 +21,7 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of, signed_distance
 from humangs_jax.data.usable_views import MASK_THRESHOLD, joint_moves, joint_turns, unusable_views
-from humangs_jax.geometry.mesh import face_crosses, unit, vertex_areas
+from humangs_jax.geometry.mesh import unit, vertex_areas, vertex_crosses
 from humangs_jax.io.images import resized
 
 INSET = (0.005, 0.025)
@@ -91,10 +91,10 @@ def displacement(body: BodyModel, capture: Capture, inset: tuple[float, float] =
     faces = np.asarray(body.faces)
     held = HELD * np.asarray(body.skinning_weights) @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
     for _ in range(ITERATIONS):
-        moved, normals = rest + total, _normals(rest + total, faces)
+        moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
         count, summed = _targets(views, moved, normals, faces, inset)
         total += _spread(moved, faces, count, summed, held)[:, None] * normals
-    moved, normals = rest + total, _normals(rest + total, faces)
+    moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
     total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
     return total.astype(np.float32)
 
@@ -271,8 +271,3 @@ def _at(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]) -> F
     """Bilinear; pixel centres at + 0.5."""
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
     return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)
-
-
-def _normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
-    across = np.repeat(face_crosses(vertices, faces), 3, axis=0)
-    return unit(np.stack([np.bincount(faces.ravel(), across[:, i], len(vertices)) for i in range(3)], axis=-1))

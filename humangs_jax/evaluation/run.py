@@ -28,8 +28,14 @@ from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
-from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
-from humangs_jax.evaluation.scores import missing_reasons, on_background, score_names, score_views
+from humangs_jax.evaluation.scores import (
+    EvaluationProtocol,
+    find_protocol,
+    missing_reasons,
+    on_background,
+    score_names,
+    score_views,
+)
 from humangs_jax.evaluation.tables import (
     COLUMNS,
     CONFIDENCE,

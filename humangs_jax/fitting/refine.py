@@ -13,10 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body, without_expression
-from humangs_jax.body.skinning import EXACT, SurfacePoints, pose_points
+from humangs_jax.body.model import (
+    BODY_NAMES,
+    EXACT,
+    BodyModel,
+    BodyPose,
+    SurfacePoints,
+    pose_body,
+    pose_features,
+    pose_points,
+    shape_body,
+    without_expression,
+)
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture

@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from humangs_jax.body.joints import FINGERS
-from humangs_jax.body.model import BodyPose
+from humangs_jax.body.model import FINGERS, BodyPose
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.progress import text_table
 from humangs_jax.fitting.solve import Outcome

@@ -21,6 +21,12 @@ def vertex_areas(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
+def vertex_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+    """The sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of it. 0 where there is no face."""
+    around = np.tile(face_crosses(vertices, faces), (3, 1))
+    return np.stack([np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1)
+
+
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Vectors over their lengths; those without length as they are."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float, Scalar
 from humangs_jax.core.configuration import Range, Share, Weight, configuration
 from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.metrics import multiscale_structural_dissimilarity
 from humangs_jax.losses.perceptual import lpips, perceptual_loss
-from humangs_jax.losses.ssim import multiscale_structural_dissimilarity
 from humangs_jax.network.parts import Drawn
 
 T = TypeVar("T")

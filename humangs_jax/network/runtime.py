@@ -122,7 +122,7 @@ class Conventions:
     rendering: Literal["exact", "inria"] = "exact"
     """How they are drawn."""
     skinning_reach: Length | None = None
-    """Gaussians between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`);
+    """Gaussians between the legs farther than this from their vertex, metres, move with both (`body.model.spread_weights`);
     None: all with their vertex."""
     light: bool = False
     """Other poses are drawn in the light of the photos (`avatar.light`)."""

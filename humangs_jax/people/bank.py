@@ -31,8 +31,17 @@ from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading, write_json
 from humangs_jax.people.anatomy import HEAD, joint_positions
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.rendering import PosedSubject, light_points, paint, pose_subject, spots_at
-from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, split_of
+from humangs_jax.people.subject import (
+    GENERATOR_VERSION,
+    PosedSubject,
+    SyntheticSubject,
+    light_points,
+    make_subject,
+    paint,
+    pose_subject,
+    split_of,
+    spots_at,
+)
 from humangs_jax.people.surfaces import vertex_normals
 from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 

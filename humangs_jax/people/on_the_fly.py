@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.body.model import joint_transforms
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob

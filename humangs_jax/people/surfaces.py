@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float, Int
-from humangs_jax.geometry.mesh import face_crosses
+from humangs_jax.geometry.mesh import vertex_crosses
 from humangs_jax.rendering.mesh.atlas import Faces, Points, edges_of, unit
 
 
@@ -148,7 +148,7 @@ def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
 
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
     """(n, 3) area-weighted unit normals."""
-    return unit(scatter_add(faces.T.reshape(-1), np.tile(face_crosses(vertices, faces), (3, 1)), len(vertices)))
+    return unit(vertex_crosses(vertices, faces).astype(np.float32))
 
 
 def scatter_add(indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int) -> np.ndarray:

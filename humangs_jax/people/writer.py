@@ -40,9 +40,17 @@ from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan
 from humangs_jax.people.cameras import Angles, cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
 from humangs_jax.people.sequences import sample_sequence
-from humangs_jax.people.subject import GENERATOR_VERSION, SyntheticSubject, make_subject, seeds_of, split_of
+from humangs_jax.people.subject import (
+    GENERATOR_VERSION,
+    PosedSubject,
+    SyntheticSubject,
+    make_subject,
+    pose_subject,
+    render_view,
+    seeds_of,
+    split_of,
+)
 from humangs_jax.people.surfaces import Points
 
 HELD_OUT = "held_out"

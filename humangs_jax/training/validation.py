@@ -15,9 +15,8 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loading import Example, ViewSampling
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent
+from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent, similarity_map
 from humangs_jax.losses.perceptual import lpips
-from humangs_jax.losses.ssim import similarity_map
 from humangs_jax.network.parts import Variables
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import predict

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from humangs_jax.apps import held_out
-from humangs_jax.apps.held_out import better_body, held_out_psnr
+from humangs_jax.apps import start
+from humangs_jax.apps.start import better_body, held_out_psnr
 from humangs_jax.body.library import load_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.network.presets import tiny
@@ -19,11 +19,11 @@ def body():
 
 def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, monkeypatch):
     avatar, capture, given = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.0), views=4), []
-    monkeypatch.setattr(held_out, "reconstruct", lambda _, __, others: given.append(others.names) or avatar)
+    monkeypatch.setattr(start, "reconstruct", lambda _, __, others: given.append(others.names) or avatar)
     found = held_out_psnr({}, tiny(), capture, None)
     assert set(capture.names) - set(given[0]) == {found.name} and len(given[0]) == 4  # a copy in its place
     assert found.psnr > 25 and found.name in str(found)
-    monkeypatch.setattr(held_out, "reconstruct", lambda *_: toy_avatar(body, 0.15))
+    monkeypatch.setattr(start, "reconstruct", lambda *_: toy_avatar(body, 0.15))
     assert held_out_psnr({}, tiny(), capture, None).psnr < found.psnr - 3
 
 
@@ -36,7 +36,7 @@ def test_few_photos_and_photos_without_masks_hold_none_out(body):
 def test_the_body_with_the_better_avatar_is_taken(body, monkeypatch):
     capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
     other, wrong = dataclasses.replace(capture, body_file="other"), {}
-    monkeypatch.setattr(held_out, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong[photos.body_file]))
+    monkeypatch.setattr(start, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong[photos.body_file]))
     for first, second, taken in ((0.15, 0.0, other), (0.0, 0.15, capture), (0.0, 0.0, capture)):
         wrong |= {capture.body_file: first, "other": second}
         found, estimate = better_body({}, tiny(), capture, other, None)

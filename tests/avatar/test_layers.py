@@ -53,7 +53,7 @@ def test_normals_of_a_stretched_surface_stay_perpendicular():
     weights[:, 0] = 1 - share
     avatar = replace(avatar, skinning_weights=jnp.asarray(weights))
     pose = BodyPose(jnp.asarray([[0, 0, 0], [0, 0, 0.9], [0, 0, 0]], jnp.float32), jnp.zeros(3))
-    from humangs_jax.body.skinning import blend_transforms, joint_transforms
+    from humangs_jax.body.model import blend_transforms, joint_transforms
 
     transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     linear = np.asarray(blend_transforms(avatar.skinning_weights, transforms))[:, :3, :3]

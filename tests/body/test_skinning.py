@@ -6,13 +6,13 @@ from body_cases import PARENTS, random_pose, world_frames
 from rounding import bound
 from scipy.special import ndtr
 
-from humangs_jax.body import skinning
+from humangs_jax.body import model
 from humangs_jax.geometry import transform
 
 EXACT = 1e-12  # float64 against float64
 ATOL = 5e-6  # float32, chains of 4 joints, lengths of about 1
 
-joint_transforms = jax.jit(skinning.joint_transforms, static_argnums=1)
+joint_transforms = jax.jit(model.joint_transforms, static_argnums=1)
 
 
 def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
@@ -20,7 +20,7 @@ def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
     above = lambda j, steps: (
         j if j == count or not steps else above(PARENTS[j] if PARENTS[j] >= 0 else count, steps - 1)
     )
-    iterations = skinning.ancestors(PARENTS)
+    iterations = model.ancestors(PARENTS)
     for i, up in enumerate(iterations):
         assert list(up) == [above(j, 2**i) for j in range(count)]
     assert all(above(j, 2 ** len(iterations)) == count for j in range(count))
@@ -29,7 +29,7 @@ def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
 @pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (-1, -2), (1, 2, 0)])
 def test_what_is_no_tree_is_refused(parents):
     with pytest.raises(ValueError, match="root"):
-        skinning.ancestors(parents)
+        model.ancestors(parents)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -64,7 +64,7 @@ def test_blending_is_a_weighted_sum():
     rng = np.random.default_rng(0)
     weights, transforms = rng.uniform(size=(6, 3)), rng.normal(size=(3, 4, 4))
     expected = [sum(w * t for w, t in zip(row, transforms, strict=True)) for row in weights]
-    found = skinning.blend_transforms(jnp.asarray(weights, jnp.float32), jnp.asarray(transforms, jnp.float32))
+    found = model.blend_transforms(jnp.asarray(weights, jnp.float32), jnp.asarray(transforms, jnp.float32))
     assert np.allclose(found, expected, atol=ATOL)
     points = rng.normal(size=(6, 3))
     applied = transform.apply(found, jnp.asarray(points, jnp.float32))
@@ -75,7 +75,7 @@ def test_blending_is_a_weighted_sum():
 def test_nested_vmap_compiles():
     joints = jnp.asarray(np.random.default_rng(0).normal(size=(2, len(PARENTS), 3)), jnp.float32)
     rotations = jnp.zeros((2, 3, len(PARENTS), 3))
-    run = lambda joint, r: skinning.joint_transforms(joint, PARENTS, r, jnp.zeros(3))
+    run = lambda joint, r: model.joint_transforms(joint, PARENTS, r, jnp.zeros(3))
     found = jax.jit(jax.vmap(jax.vmap(run, (None, 0))))(joints, rotations)
     assert np.allclose(found, np.eye(4), atol=ATOL)
 
@@ -88,7 +88,7 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
     points = np.concatenate([row(0.0)[100:200], row(-0.1), row(0.1)])
     own = np.concatenate([joints[:100], joints])
     distances = np.concatenate([np.full(100, 0.1), np.zeros(800)])
-    run = jax.jit(skinning.spread_weights, static_argnums=6)
+    run = jax.jit(model.spread_weights, static_argnums=6)
     arrays = [jnp.asarray(x, jnp.float32) for x in (points, distances, own, vertices, joints)]
     legs = jnp.eye(2, dtype=bool)
     found = run(*arrays, legs, 0.04)
@@ -108,5 +108,5 @@ def test_the_kernel_of_spread_weights_is_as_wide_as_the_distance(distance):
     distances = np.where(np.arange(16) % 4 == 0, distance, 0.0)
     own = np.tile([1.0, 0.0], (16, 1))
     arrays = [jnp.asarray(each, jnp.float32) for each in (points, distances, own, vertices, of)]
-    found = skinning.spread_weights(*arrays, jnp.eye(2, dtype=bool), 0.04)
+    found = model.spread_weights(*arrays, jnp.eye(2, dtype=bool), 0.04)
     np.testing.assert_allclose(found[::4, 1], ndtr(at / distance), atol=0.02)  # every eighth vertex: steps of 2 mm

@@ -119,13 +119,6 @@ def test_batches_are_a_function_of_seed_and_step(folder, source):
     assert not same(source.batch_at(5), source.batch_at(6))
 
 
-def test_iterating_resumes_to_the_very_batch(source):
-    whole = dict(source.batches(0, 6))
-    rest = dict(source.batches(3, 6))
-    assert sorted(whole) == list(range(6)) and sorted(rest) == [3, 4, 5]
-    assert all(same(whole[step], rest[step]) for step in rest)
-
-
 def test_a_pass_shows_every_subject_once(source):
     shown = [greys(source.source.example(0, i, 2).inputs)[0][0] for i in range(8)]
     assert sorted(shown[:4]) == sorted(shown[4:]) == [0, 1, 2, 3]
@@ -234,13 +227,6 @@ def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
     source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
     with pytest.raises(ValueError, match=r"none of the 1 capture folders can be used.*need 4"):
         next(source.batches(0, 1))
-
-
-def test_leaving_the_loop_ends_the_thread(source):
-    batches = source.batches(0, 100)
-    next(batches)
-    batches.close()
-    assert not [t for t in threading.enumerate() if t.name == "humangs-loader"]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from evaluation_cases import ellipse
 from scipy import ndimage
 
 from humangs_jax.cli.evaluate import Evaluate
-from humangs_jax.evaluation.protocol import (
+from humangs_jax.evaluation.scores import (
     PROTOCOLS,
     CentredWindow,
     EvaluationProtocol,
@@ -18,7 +18,7 @@ from humangs_jax.evaluation.protocol import (
     WholeFrame,
     find_protocol,
 )
-from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM
+from humangs_jax.losses.metrics import GAUSSIAN, TORCHMETRICS, UNIFORM
 
 
 def blob(seed, height, width):

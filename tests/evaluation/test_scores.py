@@ -11,10 +11,9 @@ from rounding import bound
 from skimage.metrics import structural_similarity
 
 from humangs_jax.evaluation import scores
-from humangs_jax.evaluation.protocol import PROTOCOLS, CentredWindow
-from humangs_jax.losses.metrics import boundary_psnr
+from humangs_jax.evaluation.scores import PROTOCOLS, CentredWindow
+from humangs_jax.losses.metrics import GAUSSIAN, TORCHMETRICS, UNIFORM, boundary_psnr, mean_similarity, similarity_map
 from humangs_jax.losses.perceptual import lpips
-from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, mean_similarity, similarity_map
 
 DECIBELS = 1e-4
 """Of a mean of some thousand float32 squares: 10 / ln 10 times their relative error of 1e-5 at most."""

@@ -1,3 +1,6 @@
+""""""
+
+import dataclasses
 import json
 
 import jax
@@ -5,17 +8,42 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting.files import save_scan_fit
-from humangs_jax.fitting.residuals.scan import body_surface
-from humangs_jax.fitting.scan_files import checked_joints, read_joints, sample_scan
+from humangs_jax.fitting.residuals.scan import (
+    Given,
+    ScanMatches,
+    Tolerances,
+    body_surface,
+    one_sided,
+    pose_surface,
+    pose_vertices,
+    scan_problem,
+    scan_residuals,
+)
+from humangs_jax.fitting.scan_files import (
+    checked_joints,
+    directions_around,
+    joints_from_views,
+    read_joints,
+    read_mesh,
+    read_scan,
+    render_scan_views,
+    sample_scan,
+)
 from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
-from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts
+from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts, start_state
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.state import pose_prior
+from humangs_jax.geometry.camera import project
+from humangs_jax.io.mesh import GREY
 from humangs_jax.io.npz import read_npz
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
@@ -178,3 +206,284 @@ def test_facing_back_twice_is_facing_forward(body):
     points = np.random.default_rng(0).normal(size=(4, 3))
     assert np.abs(once.align(points) - start.align(points)).max() > 0.1
     np.testing.assert_allclose(twice.align(points), start.align(points), atol=1e-5)
+
+
+# Scans from files, and images of scans --------------------------------------------------------------------------------
+
+
+def sphere(radius=1.0, subdivisions=3):
+    return trimesh.creation.icosphere(subdivisions, radius)
+
+
+def test_points_lie_on_the_surface_with_normals_outwards():
+    scan = sample_scan(sphere(2.0).vertices + 7, sphere().faces, 500)
+    outward = (scan.points - 7) / 2
+    assert len(scan.points) > 480
+    assert np.all(np.linalg.norm(outward, axis=1) > 0.98)
+    assert np.einsum("pa,pa->p", outward, scan.normals).min() > 0.9
+    assert not scan.turned
+
+
+def test_points_are_as_many_per_area():
+    wide = trimesh.creation.box((4, 1, 1))
+    scan = sample_scan(wide.vertices, wide.faces, 4000)
+    ends = np.mean(np.abs(scan.normals[:, 0]) > 0.5)
+    assert ends == pytest.approx(2 / 18, abs=0.02)
+
+
+def test_faces_inside_out_are_turned():
+    scan = sample_scan(sphere().vertices, sphere().faces[:, ::-1], 500)
+    assert scan.turned
+    assert np.einsum("pa,pa->p", scan.points, scan.normals).min() > 0.9
+
+
+def test_what_nobody_sees_is_left_out():
+    inner, outer = sphere(0.8), sphere(1.0)
+    both = trimesh.util.concatenate([outer, inner])
+    scan = sample_scan(both.vertices, both.faces, 6000)
+    assert np.linalg.norm(scan.points, axis=1).min() > 0.95
+    assert scan.hidden == pytest.approx(0.64 / 1.64, abs=0.05)
+
+
+def test_reading_is_the_same_every_time(tmp_path):
+    sphere().export(tmp_path / "ball.ply")
+    first, second = (read_scan(tmp_path / "ball.ply", 300) for _ in range(2))
+    np.testing.assert_array_equal(first.points, second.points)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl"])
+def test_formats(tmp_path, suffix):
+    sphere(1.5).export(tmp_path / f"ball.{suffix}")
+    scan = read_scan(tmp_path / f"ball.{suffix}", 300)
+    assert np.linalg.norm(scan.points, axis=1).mean() == pytest.approx(1.5, abs=0.02)
+
+
+def test_parts_of_a_scene_are_where_the_scene_has_them(tmp_path):
+    scene = trimesh.Scene()
+    move = np.eye(4)
+    move[0, 3] = 10
+    scene.add_geometry(sphere(), node_name="here")
+    scene.add_geometry(sphere(), node_name="there", transform=move)
+    scene.export(tmp_path / "two.glb")
+    assert np.ptp(read_mesh(tmp_path / "two.glb").vertices[:, 0]) == pytest.approx(12, abs=0.1)
+
+
+def boxes(folder):
+    """Objects and materials in turn, each with its own vertices, quads among triangles; as (vertices, faces) and as a file."""
+    vertices, faces, lines = [], [], ["mtllib boxes.mtl"]
+    for i in range(6):
+        box = trimesh.creation.box((1, 1, 1)).subdivide()
+        box.apply_translation([2.0 * i, 0, 0])
+        start = sum(map(len, vertices))
+        lines += [f"o box{i}", f"g part{i}", *(f"v {x} {y} {z}" for x, y, z in box.vertices), f"usemtl paint{i % 2}"]
+        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[:40]]
+        lines += ["s off", f"usemtl paint{(i + 1) % 2}"]
+        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[40:]]
+        vertices.append(box.vertices)
+        faces.append(box.faces + start)
+    (folder / "boxes.mtl").write_text("newmtl paint0\nKd 1 0 0\nnewmtl paint1\nKd 0 1 0\n")
+    (folder / "boxes.obj").write_text("\n".join(lines))
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+@pytest.mark.parametrize("colors", [False, True])
+def test_objects_and_materials_in_turn_keep_every_face(tmp_path, colors):
+    vertices, faces = boxes(tmp_path)
+    mesh = read_mesh(tmp_path / "boxes.obj", colors=colors)
+    triangles = lambda corners: np.sort(np.round(corners.reshape(len(corners), -1), 6), axis=0)
+    np.testing.assert_allclose(triangles(mesh.vertices[mesh.faces]), triangles(vertices[faces]), atol=1e-6)
+
+
+def textured(folder, name="skin.png"):
+    """A sphere whose texture is red, and named `name` in its material."""
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "skin.png")
+    ball = sphere()
+    (folder / "ball.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
+    lines = ["mtllib ball.mtl", "usemtl skin", *(f"v {x} {y} {z}" for x, y, z in ball.vertices)]
+    lines += [f"vt {x / 2 + 0.5} {y / 2 + 0.5}" for x, y, _ in ball.vertices]
+    lines += ["f " + " ".join(f"{corner + 1}/{corner + 1}" for corner in face) for face in ball.faces]
+    (folder / "ball.obj").write_text("\n".join(lines))
+    return folder / "ball.obj"
+
+
+def test_a_scan_has_the_colors_of_its_texture_and_is_grey_with_a_warning_without_it(tmp_path, caplog):
+    red = read_mesh(textured(tmp_path), colors=True).visual.vertex_colors
+    assert (red == [255, 0, 0, 255]).all() and not caplog.records
+    grey = read_mesh(textured(tmp_path, "moved.png"), colors=True).visual.vertex_colors
+    assert (grey[:, :3] == GREY).all()
+    (record,) = caplog.records
+    assert "ball.obj: left out 'moved.png':" in record.getMessage() and "no such file" in record.getMessage()
+
+
+def bad_files(folder):
+    ball = sphere()
+    ball.export(folder / "good.obj")
+    (folder / "text.obj").write_text("hello")
+    (folder / "rubbish.glb").write_bytes(b"glTF rubbish")
+    (folder / "cloud.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+    (folder / "triangle.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    broken = ball.vertices.copy()
+    broken[3] = np.nan
+    trimesh.Trimesh(broken, ball.faces, process=False).export(folder / "nan.ply")
+    trimesh.Trimesh(np.zeros_like(broken), ball.faces, process=False).export(folder / "point.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("missing.obj", "no such file"),
+        ("text.obj", "no faces|not a mesh"),
+        ("rubbish.glb", "not a mesh"),
+        ("cloud.obj", "no faces"),
+        ("triangle.obj", "1 faces: expected the surface of a person"),
+        ("nan.ply", "not finite"),
+        ("point.ply", "no area"),
+    ],
+)
+def test_what_is_no_scan_is_refused_by_name(tmp_path, name, message):
+    bad_files(tmp_path)
+    with pytest.raises(ValueError, match=message) as error:
+        read_scan(tmp_path / name)
+    assert name in str(error.value)
+
+
+def test_directions_are_spread():
+    directions = directions_around(48)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    nearest = np.sort(directions @ directions.T, axis=1)[:, -2]
+    assert np.degrees(np.arccos(nearest)).min() > 15
+
+
+def blocks(path, up=2):
+    """A tall box with a head, painted red, that stands along an axis, large and far from the origin."""
+    body, head = trimesh.creation.box((40, 40, 150)), trimesh.creation.icosphere(2, 25)
+    head.apply_translation([0, 0, 95])
+    mesh = trimesh.util.concatenate([body.subdivide(), head])
+    mesh.apply_transform({2: np.eye(4), 0: trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0])}[up])
+    mesh.apply_translation([500, 20, -30])
+    mesh.visual.vertex_colors = np.tile([255, 0, 0, 255], (len(mesh.vertices), 1))
+    mesh.export(path)
+    return np.asarray(mesh.vertices)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("up", [2, 0])
+def test_images_show_the_scan_upright_and_in_its_colors(tmp_path, up):
+    blocks(tmp_path / "scan.ply", up)
+    photos = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
+    rows, columns = np.nonzero(photos.masks[0])
+    assert np.ptp(rows) > 35 and np.ptp(rows) > 2.5 * np.ptp(columns)
+    inside = photos.images[0][photos.masks[0] > 0.9]
+    assert inside[:, 0].min() > 0.3 and inside[:, 1:].max() < 0.1
+
+
+@pytest.mark.slow
+def test_what_a_detector_sees_comes_back_as_joints_of_the_scan(tmp_path):
+    vertices = blocks(tmp_path / "scan.ply")
+    folder = render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=4, size=64)
+    photos = load_photos(folder)
+    true = vertices[np.random.default_rng(0).integers(0, len(vertices), 17)]
+    import json
+
+    matrix = np.asarray(json.loads((folder / "scan.json").read_text())["world_from_scan"])
+    world = jnp.asarray(true @ matrix[:3, :3].T + matrix[:3, 3], jnp.float32)
+    points = np.stack([np.asarray(project(photos.cameras[i], world)[0]) for i in range(4)])
+    confidences = np.ones((4, 17), np.float32)
+    confidences[:, 3] = 0
+    joints = joints_from_views(folder, Keypoints(points.astype(np.float32), confidences, COCO_17))
+    assert len(joints) == 16 and COCO_17.names[3] not in joints
+    for name, point in joints.items():
+        np.testing.assert_allclose(point, true[COCO_17.names.index(name)], atol=0.5)  # of 200 units
+    confidences[1:] = 0
+    with pytest.raises(ValueError, match="agree on 0 landmarks"):
+        joints_from_views(folder, Keypoints(points.astype(np.float32), confidences, COCO_17))
+
+
+def test_wrong_axes_and_full_folders_are_refused(tmp_path):
+    blocks(tmp_path / "scan.ply")
+    with pytest.raises(ValueError, match="up y: expected one of"):
+        render_scan_views(tmp_path / "scan.ply", tmp_path / "views", up="y")
+    with pytest.raises(ValueError, match="not empty"):
+        render_scan_views(tmp_path / "scan.ply", tmp_path)
+
+
+#  ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def problem(body):
+    return scan_problem(body_surface(body, ("left_hip", "nose"), 1500), body.joint_names)
+
+
+@pytest.fixture(scope="module")
+def case(problem):
+    """Pairs, given landmarks, tolerances and a state, random."""
+    rng, number = np.random.default_rng(0), lambda x: jnp.asarray(x, jnp.float32)
+    rows = rng.integers(0, 1500, 600)
+    normals = rng.normal(size=(600, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matches = ScanMatches(
+        jnp.asarray(rows, jnp.int32),
+        number(rng.normal(size=(600, 3))),
+        number(normals),
+        jnp.full(600, 0.02),
+        jnp.ones(600),
+    )
+    given = Given(jnp.zeros((2, 3)), jnp.ones(2), number(0.1), number(1.8), number(1))
+    state = start_state(problem, problem.prior.mean)
+    return matches, given, Tolerances(number(0.01), number(0.02), number(1.0)), state
+
+
+def test_the_surface_is_the_bodys(body):
+    surface = body_surface(body, ("nose",), 13380)
+    rng = np.random.default_rng(0)
+    pose = BodyPose(jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.asarray([0.1, 0.2, 0.3]))
+    betas = jnp.asarray(rng.normal(size=22), jnp.float32)
+    true = pose_body(body, shape_body(body, betas), pose)
+    vertices, normals = pose_surface(surface, betas, pose)
+    some, _, joints = pose_vertices(surface, jnp.asarray([5, 2]), betas, pose)
+    np.testing.assert_allclose(vertices, true.vertices, atol=1e-5)
+    np.testing.assert_allclose(some, true.vertices[jnp.asarray([5, 2])], atol=1e-5)
+    np.testing.assert_allclose(joints, true.joints, atol=1e-5)
+    assert np.linalg.norm(normals, axis=1).min() > 0.99
+
+
+def test_hands_are_what_is_not_covered(problem):
+    surface, names = problem.surface, problem.surface.landmarks.joint_names
+    owner = np.asarray(names)[np.asarray(surface.points.weights).argmax(1)]
+    covered = np.asarray(surface.covered)
+    assert covered[owner == "left_index3"].max() < 0.1
+    assert covered[owner == "left_knee"].min() > 0.99
+
+
+@pytest.mark.slow
+def test_columns_of_the_jacobian_are_derivatives(problem, case):
+    """XLA's CPU compiler got them wrong where the distances were sums over an axis."""
+    matches, given, tolerances, state = case
+    leaves, tree = jax.tree.flatten(state)
+    residuals = lambda y: scan_residuals(problem, matches, given, tolerances, jax.tree.unflatten(tree, y))["surface"]
+    columns = jax.jit(jax.jacfwd(residuals))(leaves)
+    one = jax.jit(lambda y, direction: jax.jvp(residuals, (y,), (direction,))[1])
+    for i in (0, len(leaves) - 1):  # shape and size
+        direction = [jnp.zeros_like(leaf) for leaf in leaves]
+        direction[i] = direction[i].reshape(-1).at[0].set(1.0).reshape(leaves[i].shape)
+        column = np.asarray(columns[i]).reshape(len(matches.rows), -1)[:, 0]
+        np.testing.assert_allclose(column, one(leaves, direction), atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_smaller_scan_is_no_nearer(problem, case):
+    """Shrinking body and scan together changes no distance: in the body's own metres it would."""
+    matches, given, tolerances, state = case
+    away = lambda s, m: np.asarray(scan_residuals(problem, m, given, tolerances, s)["surface"])
+    posed, _ = pose_surface(problem.surface, *problem.body(state))
+    exact = dataclasses.replace(matches, points=posed[matches.rows])
+    assert np.abs(away(state, exact)).max() < 1e-3
+    half = dataclasses.replace(state, log_scale=jnp.float32(np.log(0.5) / 0.05))  # metres per unit of the frame
+    twice = dataclasses.replace(matches, points=2 * posed[matches.rows] + 0.01 * matches.normals)
+    np.testing.assert_allclose(away(half, twice), 0.01 / 0.02, atol=1e-3)
+
+
+def test_outside_counts_less_than_inside():
+    away = one_sided(jnp.asarray([0.01, -0.01]), jnp.asarray([0.02, 0.02]), jnp.asarray(0.005))
+    np.testing.assert_allclose(away, [0.5, -2.0])

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel
-from humangs_jax.body.skinning import SurfacePoints
+from humangs_jax.body.model import SurfacePoints
 
 JOINTS = np.asarray([[0, 0, 0], [0, 0.5, 0], [0, 1.0, 0], [0.5, 1.0, 0]], np.float32)
 

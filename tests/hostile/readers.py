@@ -22,8 +22,7 @@ from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
 from humangs_jax.apps.start import look
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
-from humangs_jax.body.library import load_body, save_body
-from humangs_jax.body.smplx import load_hands, load_smplx
+from humangs_jax.body.library import load_body, load_hands, load_smplx, save_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras

@@ -93,10 +93,6 @@ def fault(case, result: dict) -> str:
     return ""
 
 
-def test_there_are_enough():
-    assert len(CASES) >= 400
-
-
 @pytest.mark.parametrize("item", ITEMS)
 def test_some_files_of_each_item(item, tmp_path):
     light = [case for case in CASES if case.item == item and not any(word in case.name for word in HEAVY)]

@@ -10,7 +10,7 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.people import bank, cameras, rendering, subject, writer
+from humangs_jax.people import bank, cameras, subject, writer
 from humangs_jax.people.subject import DEMO
 from humangs_jax.rendering.mesh import atlas, rasterizer
 from humangs_jax.rendering.mesh.rasterizer import sample_texture
@@ -88,7 +88,7 @@ def test_the_texture_says_what_the_materials_say(person, baked):
     rng = np.random.default_rng(0)
     faces = rng.integers(len(person.surface.faces), size=4000)
     weights = rng.dirichlet(np.ones(3), size=4000).astype(np.float32)
-    albedo, slopes = rendering.paint(person, faces, rendering.spots_at(person, faces, weights))
+    albedo, slopes = subject.paint(person, faces, subject.spots_at(person, faces, weights))
     uv = sum(weights[:, i : i + 1] * baked.atlas.uvs[baked.atlas.faces[faces, i]] for i in range(3))
     look = lambda texture: np.asarray(sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None])))[0]
     error = np.abs(look(baked.albedo) / 255 - np.clip(albedo, 0, 1))
@@ -149,7 +149,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
         np.testing.assert_array_equal(texture, bank.lit_texture(posed, baked))
         textures.append(texture)
     camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
-    direct, mask = rendering.render_view(posed, camera)
+    direct, mask = subject.render_view(posed, camera)
     faces, uvs = jnp.asarray(mesh.faces, jnp.int32), jnp.asarray(mesh.visual.uv, jnp.float32)
     vertices, texture = jnp.asarray(mesh.vertices, jnp.float32), jnp.asarray(textures[0] / 255, jnp.float32)
     seen = rasterizer.rasterize_mesh(vertices, faces, camera.resized(2 * camera.width, 2 * camera.height))

@@ -16,7 +16,7 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.presets import tiny
-from humangs_jax.people import cameras, on_the_fly, rendering, shading
+from humangs_jax.people import cameras, on_the_fly, shading, subject
 from humangs_jax.people.anatomy import joint_positions
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
@@ -180,11 +180,11 @@ def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
     person = make_subject(SEEDS[int(scene.person)], body)
     person = dataclasses.replace(person, lights=scene.lights)
     scene = replace(scene, dyes=jnp.tile(jnp.eye(3), (bank.sheen.shape[1], 1, 1)))
-    posed = rendering.pose_subject(person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0]))
+    posed = subject.pose_subject(person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0]))
     np.testing.assert_allclose(scene.vertices[0][: len(posed.vertices)], posed.vertices, atol=SKIN_DEPTH)
     camera = draw(scene, bank, 0, 0.0, SIZE)
     image, mask, _ = draw_view(bank, scene, jnp.int32(0), camera)
-    expected, coverage = rendering.render_view(posed, camera)
+    expected, coverage = subject.render_view(posed, camera)
     assert np.abs(np.asarray(mask) - coverage).mean() < 1e-3
     assert -10 * np.log10(np.mean((np.asarray(image) - expected) ** 2)) > LIKE_RENDERED
 

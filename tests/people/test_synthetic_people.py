@@ -6,7 +6,7 @@ import pytest
 
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people import cameras, fabrics, rendering, subject, writer
+from humangs_jax.people import cameras, fabrics, subject, writer
 from humangs_jax.people.anatomy import LEFT_HIP, LEFT_KNEE
 from humangs_jax.people.fabrics import PATTERNS
 from humangs_jax.people.subject import DEMO
@@ -38,7 +38,7 @@ def views(posed):
     for i, p in enumerate(posed):
         rng = np.random.default_rng(i)
         batch = cameras.cameras_around(rng, p.vertices, cameras.spread_azimuths(rng, 3), SIZE)
-        images, masks = zip(*(rendering.render_view(p, batch[k]) for k in range(3)), strict=True)
+        images, masks = zip(*(subject.render_view(p, batch[k]) for k in range(3)), strict=True)
         result.append((batch, np.stack(images), np.stack(masks)))
     return result
 
@@ -51,7 +51,7 @@ def test_a_seed_is_a_person_bit_for_bit(body, people, posed, views):
     p = writer.sample_pose(again, 0)
     np.testing.assert_array_equal(p.rotations, posed[0].rotations)
     batch, images, masks = views[0]
-    image, mask = rendering.render_view(p, batch[1])
+    image, mask = subject.render_view(p, batch[1])
     np.testing.assert_array_equal(image, images[1])
     np.testing.assert_array_equal(mask, masks[1])
 
@@ -107,7 +107,7 @@ def test_cloth_covers_and_leaves_the_body(body, people, posed):
         rng = np.random.default_rng(0)
         camera = cameras.cameras_around(rng, p.vertices, np.asarray([0.4]), SIZE)[0]
         skin = np.asarray(rasterize_mesh(naked.vertices, body.faces, camera).face_ids) >= 0
-        fragments = rasterize_mesh(*rendering.padded(p.vertices, person.surface.faces), camera)
+        fragments = rasterize_mesh(*subject.padded(p.vertices, person.surface.faces), camera)
         ids = np.asarray(fragments.face_ids)
         dressed = ids >= 0
         assert (skin & dressed).sum() > 0.93 * skin.sum()  # the cloth is where the body is
@@ -120,7 +120,7 @@ def test_hardly_any_skin_pokes_through(people, posed, views):
     for person, p, (batch, _, _) in zip(people, posed, views, strict=True):
         faces = person.surface.faces
         for k in range(3):
-            fragments = rasterize_mesh(*rendering.padded(p.vertices, faces), batch[k])
+            fragments = rasterize_mesh(*subject.padded(p.vertices, faces), batch[k])
             ids, weights = np.asarray(fragments.face_ids), np.asarray(fragments.barycentrics)
             seen = ids >= 0
             under = ((person.cover > UNDER_CLOTH)[faces[ids[seen]]] * weights[seen]).sum(-1)
@@ -178,7 +178,7 @@ def test_cameras_follow_the_protocol(posed, views):
 
 def test_masks_are_the_coverage_of_the_pictures(posed, views):
     for p, (batch, images, masks) in zip(posed[:2], views[:2], strict=True):
-        black, mask = rendering.render_view(p, batch[0], background=0.0)
+        black, mask = subject.render_view(p, batch[0], background=0.0)
         np.testing.assert_array_equal(mask, masks[0])
         np.testing.assert_allclose(images[0] - black, np.broadcast_to(1 - mask[..., None], black.shape), atol=1e-6)
         assert (images[0][mask == 0] == 1).all() and images.min() >= 0 and images.max() <= 1
@@ -226,6 +226,6 @@ def test_a_written_subject_loads_back(tmp_path, body, people):
         np.asarray(inputs.cameras.center)[:, None] - np.asarray(held_out.cameras.center)[None, :2], axis=-1
     )
     assert gap.min() > 1e-3  # no held-out view is an input view
-    image, mask = rendering.render_view(writer.sample_pose(people[0], 0), inputs.cameras[1])
+    image, mask = subject.render_view(writer.sample_pose(people[0], 0), inputs.cameras[1])
     assert np.abs(image - inputs.images[1]).max() < 2 * EIGHT_BITS
     assert np.abs(mask - inputs.masks[1]).max() < 2 * EIGHT_BITS

@@ -12,7 +12,7 @@ import pytest
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, Waiting, subject_order
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.config import tiny
-from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
+from humangs_jax.training.loop import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.sources import bad_samples
 from humangs_jax.training.state import GuardState, TrainState
 

@@ -14,9 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments import chromium
 from experiments import page as evaluation
-from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.model import BodyPose, RestBody
-from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, RestBody, joint_transforms
 from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform
 from humangs_jax.viewer.page import page_server, write_page

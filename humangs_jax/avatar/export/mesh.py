@@ -24,8 +24,7 @@ from scipy.spatial import KDTree
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import Up
 from humangs_jax.avatar.export.gaussians import up_matrix, up_turn
-from humangs_jax.body.model import BodyPose
-from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.data.motion import Motion

@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.library import load_body
+from humangs_jax.body.library import HandBasis, load_body, load_hands
 from humangs_jax.body.model import BodyModel, BodyPose, PosedBody, RestBody, pose_body, shape_body
-from humangs_jax.body.smplx import HandBasis, load_hands
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.capture_checks import CaptureError, file_numbers

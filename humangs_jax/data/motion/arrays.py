@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.model import JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import MOTIONS, ArrayKeys
 from humangs_jax.data.motion.motion import MotionError, Poses, Reading

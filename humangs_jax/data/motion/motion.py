@@ -11,9 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body import skinning
-from humangs_jax.body.model import BodyPose, RestBody
-from humangs_jax.body.smplx import HandBasis
+from humangs_jax.body.library import HandBasis
+from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
@@ -227,6 +226,6 @@ def _joint_paths(
     translations: Float[Array, "m 3"],
 ) -> Float[Array, "m j 3"]:
     """(m, j, 3) joints in space."""
-    transforms = jax.vmap(skinning.joint_transforms, in_axes=(None, None, 0, 0))
+    transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
     transforms = transforms(rest_joints, parents, rotations, translations)
     return transform.apply(transforms, rest_joints)

@@ -17,7 +17,7 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt8
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.data.preprocess.protocol import VERTICAL_FOV, intrinsics
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.mesh import face_areas, face_crosses
+from humangs_jax.geometry.mesh import face_areas, unit, vertex_crosses
 from humangs_jax.io.images import to_uint8
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, sample_texture
 
@@ -82,14 +82,9 @@ class ScanRenderer:
 
 def smooth_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
     """Unit normals; vertices at one place, which texture seams double, share theirs. Zero where there is no face."""
-    _, place = np.unique(vertices, axis=0, return_inverse=True)
+    places, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
-    of_faces = face_crosses(vertices, faces)
-    sums = np.stack(
-        [np.bincount(place[faces].reshape(-1), np.repeat(of_faces[:, k], 3), len(vertices)) for k in range(3)], -1
-    )
-    normals = sums[place]
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return unit(vertex_crosses(places, place[faces]))[place]
 
 
 @functools.partial(jax.jit, static_argnames="supersample")

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import BodyModel
-from humangs_jax.body.skinning import SurfacePoints
+from humangs_jax.body.model import BodyModel, SurfacePoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.solve import robust

@@ -1,4 +1,4 @@
-// Rotations, the joint tree and poses. The formulas are those of humangs_jax/body/skinning.py:
+// Rotations, the joint tree and poses. The formulas are those of humangs_jax/body/model.py:
 //   W_j = W_p R_j,   t_j = t_p + W_p (J_j - J_p),   G_j = [W_j | t_j - W_j J_j + translation].
 // Quaternions are wxyz, matrices row-major arrays of nine numbers.
 

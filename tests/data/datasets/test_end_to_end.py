@@ -24,7 +24,7 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
-from humangs_jax.people.rendering import render_view
+from humangs_jax.people.subject import render_view
 
 TIGHT_IOU = 0.9
 """Least mean overlap of the posed body and the silhouette of a person in tight clothes."""
