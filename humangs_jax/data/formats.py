@@ -158,24 +158,25 @@ KEYPOINTS = SourceFormats(
 
 DEFAULT_FPS = 30.0
 ARRAYS = "humangs_jax.data.motion.arrays:read_arrays"
-_MOVES = ("trans", "transl")
-_AMASS_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-_FACE = ("jaw_pose", "leye_pose", "reye_pose")
+ARRAY_SUFFIXES = (".npz", ".pkl", ".pickle", ".pt", ".pth", ".npy", ".smpl", ".json", FOLDER)
+PLACES = {
+    "all": (0, 55), "body": (0, 22), "root": (0, 1), "limbs": (1, 21), "jaw": (22, 1), "left_eye": (23, 1), "right_eye": (24, 1),
+    "eyes": (23, 2), "face": (22, 3), "left_hand": (25, 15), "right_hand": (40, 15), "hands": (25, 30),
+}  # fmt: skip
+"""Of SMPL-X's joints: the first, and how many. SMPL's body and limbs end with two more, whole hands."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ArrayKeys:
-    """What the arrays of a motion are called, and what they mean."""
+    """What the arrays of one person's motion are called, and what they mean."""
 
-    kind: str
-    """ours, whole (all joints under one key), scaled (whole, translations in other units) or parts."""
     keys: tuple[str, ...]
     """A file that has all of them is of this format."""
-    poses: tuple[str, ...]
-    """Of a whole pose; of parts the root, the body, three of the face, two of the hands."""
-    moves: tuple[str, ...] = _MOVES
-    """Positions: the first that is there."""
-    rates: tuple[str, ...] = _AMASS_RATES
+    poses: dict[str, str]
+    """The key of each of `PLACES`: axis-angles or rotation matrices."""
+    moves: tuple[str, ...] = ("trans", "transl")
+    """Positions: the first that is there. Without any, people stay in place where `stays`."""
+    rates: tuple[str, ...] = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
     """Frames per second: the first that is there."""
     fps: float | None = None
     """Frames per second without any; None: there must be one."""
@@ -187,6 +188,14 @@ class ArrayKeys:
     """Other axes that are up in some of them, see `rules.up_axis`."""
     scaling: str | None = None
     """The key of what translations are divided by, 1000 without it."""
+    pivot: str = "pelvis"
+    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which positions are applied last), or
+    the "head"."""
+    stays: bool = False
+    kind: str = "poses"
+    """What reads it: "ours" are whole rotations, "points" joints in space."""
+    page: bool = True
+    """Whether the page reads it, too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,46 +206,83 @@ class MotionFormat(Format):
     """Of files of arrays by key; the first that fits a file is used, whatever its suffix."""
 
 
-def _arrays(about: str, arrays: ArrayKeys, suffixes: tuple[str, ...] = (".npz", ".pkl", ".pickle")) -> MotionFormat:
-    return MotionFormat(about, ARRAYS, suffixes, arrays=arrays)
+def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None, **more: Any) -> MotionFormat:
+    """keys: separated by spaces; poses: as "root=global_orient limbs=body_pose"."""
+    places = dict(each.split("=") for each in poses.split())
+    return MotionFormat(
+        about, ARRAYS, ARRAY_SUFFIXES, arrays=ArrayKeys(tuple(keys.split()), places, **(use or {}), **more)
+    )
 
 
-def _whole(about: str, key: str, up: str, also: tuple[str, ...] = (), with_key: tuple[str, ...] = ()) -> MotionFormat:
-    return _arrays(about, ArrayKeys("whole", (key, *with_key), (key,), up=up, also=also))
-
-
+_FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
+_PARTS = f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
+_OF_CAMERA = (
+    "trans",
+    "transl",
+    "cam_t",
+    "pred_cam_t_full",
+    "pred_cam_t",
+    "camera",
+    "cam_trans",
+    "translation",
+    "orig_cam",
+)
+_FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
+"""Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
+_ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(
     humangs=_arrays(
-        "ours", ArrayKeys("ours", ("rotations",), ("rotations",), ("translations",), ("fps",), None, fixed=True)
+        *("ours", "rotations", "all=rotations"), moves=("translations",), rates=("fps",), fixed=True, kind="ours"
     ),
     aist=_arrays(
-        "AIST++",
-        ArrayKeys(
-            *("scaled", ("smpl_poses",), ("smpl_poses",), ("smpl_trans",), ("fps",), 60.0),
-            **{"fixed": True, "scaling": "smpl_scaling"},
-        ),
+        *("AIST++", "smpl_poses", "all=smpl_poses"),
+        use={"moves": ("smpl_trans",), "rates": ("fps",), "fps": 60.0, "fixed": True, "scaling": "smpl_scaling"},
     ),
-    beat=_whole("BEAT2", "poses", "y", with_key=("expressions",)),
-    amass=_whole("AMASS", "poses", "z"),
+    wham=_arrays("WHAM", "pose_world trans_world", "all=pose_world", use=_ALONE | {"moves": ("trans_world",)}),
+    tram=_arrays("TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}),
+    human3r=_arrays(
+        "Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}
+    ),
+    sam3d=_arrays(
+        "SAM 3D Body",
+        "pred_joint_coords",
+        "all=pred_joint_coords",
+        use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"},
+    ),
+    smplcodec=_arrays(
+        *("smplcodec", "bodyPose", "body=bodyPose face=headPose left_hand=leftHandPose right_hand=rightHandPose"),
+        use=_FOUND | {"moves": ("bodyTranslation",), "rates": ("frameRate",), "stays": True},
+    ),
+    easymocap=_arrays(
+        *("EasyMocap", "Rh Th poses", "root=Rh all=poses"),
+        use=_ALONE | {"moves": ("Th",), "up": "z", "also": ("y", "-y"), "pivot": "origin"},
+    ),
+    beat=_arrays("BEAT2", "poses expressions", "all=poses"),
+    amass=_arrays("AMASS", "poses", "all=poses", up="z"),
+    prior=_arrays(
+        *(
+            "HuMoR, SLAHMR",
+            "root_orient pose_body",
+            "root=root_orient limbs=pose_body jaw=pose_jaw eyes=pose_eye hands=pose_hand",
+        ),
+        use={"fps": DEFAULT_FPS, "up": "z", "also": ("y", "-y")},
+    ),
     lhm=_arrays(
-        "LHM, a pose a file",
-        ArrayKeys(
-            *("parts", ("root_pose",), ("root_pose", "body_pose", *_FACE, "lhand_pose", "rhand_pose")),
-            *(("trans",), (), DEFAULT_FPS, "y", False, ("-y",)),
-        ),
-        (".json", FOLDER),
+        *("LHM, a pose a file", "root_pose"),
+        f"root=root_pose limbs=body_pose {_FACE}left_hand=lhand_pose right_hand=rhand_pose",
+        use=_FOUND | {"moves": ("trans",)},
     ),
-    parts=_arrays(  # estimators write it in the coordinates of a camera, whose y points down
-        "THuman4.0, AvatarReX",
-        ArrayKeys(
-            *("parts", ("body_pose",), ("global_orient", "body_pose", *_FACE, "left_hand_pose", "right_hand_pose")),
-            *(("transl",), ("fps", *_AMASS_RATES), DEFAULT_FPS, "y", False, ("-y",)),
-        ),
+    parts=_arrays(
+        *("THuman4.0, AvatarReX, GVHMR, 4D-Humans, SMPLer-X", "body_pose", _PARTS),
+        use=_FOUND | {"rates": ("fps", "mocap_framerate", "mocap_frame_rate"), "stays": True},
     ),
-    smplx=_whole("SMPL-X (fullpose)", "fullpose", "z"),
-    smpl=_whole("SMPL (pose)", "pose", "z", also=("y", "-y")),
-    bvh=MotionFormat("skeletons of CMU, Mixamo, LaFAN and others", "humangs_jax.data.motion.bvh:read_bvh", (".bvh",)),
-    glb=MotionFormat("skeletons of the same names", "humangs_jax.data.motion.gltf:read_animation", (".glb",)),
+    smplx=_arrays("SMPL-X (fullpose)", "fullpose", "all=fullpose", up="z"),
+    prompthmr=_arrays("PromptHMR", "rotmat shape", "all=rotmat", use=_ALONE),
+    camera=_arrays("PromptHMR, CamSMPLify", "pose shape", "all=pose", use=_ALONE),
+    vibe=_arrays("VIBE", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
+    smpl=_arrays("SMPL (pose)", "pose", "all=pose", up="z", also=("y", "-y")),
+    bvh=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.bvh:read_bvh", (".bvh",)),
+    glb=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.gltf:read_animation", (".glb", ".vrma")),
 )
 """By name, in the order in which keys and files are asked."""
 

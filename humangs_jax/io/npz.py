@@ -1,6 +1,7 @@
 """npz archives: written whole or not at all, read without pickle, every kind of damage one error line."""
 
 import contextlib
+import io
 import math
 import os
 import threading
@@ -54,7 +55,7 @@ def read_npz(
 
 
 @contextlib.contextmanager
-def open_archive(file: BinaryIO, size: int) -> Generator[zipfile.ZipFile]:
+def open_archive(file: BinaryIO | io.BytesIO, size: int) -> Generator[zipfile.ZipFile]:
     """A zip archive whose members together stay within the limits.
 
     Raises: Refused; what zipfile raises for damaged archives.
@@ -75,13 +76,18 @@ def open_archive(file: BinaryIO, size: int) -> Generator[zipfile.ZipFile]:
         yield archive
 
 
-def _read_array(member: Any, size: int) -> np.ndarray | None:
-    """The array of a member of `size` bytes; None for pickled objects. Nothing is made before its size is checked."""
-    version = np.lib.format.read_magic(member)
+def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order (columns first?) and type of an npy array, whose bytes follow in the file. Raises: Refused."""
+    version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
         raise Refused(f"version {version} of the npy format is not read")
     with _ONE_AT_A_TIME:
-        shape, columns_first, dtype = _HEADERS[version](member, max_header_size=LONGEST_HEADER)
+        return _HEADERS[version](file, max_header_size=LONGEST_HEADER)
+
+
+def _read_array(member: Any, size: int) -> np.ndarray | None:
+    """The array of a member of `size` bytes; None for pickled objects. Nothing is made before its size is checked."""
+    shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:
         return None
     if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):

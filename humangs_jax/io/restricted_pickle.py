@@ -98,6 +98,8 @@ class _Counted:
 
 
 def _checked_key(key: Any) -> Any:
+    if isinstance(key, _Array) and key.state.get("shape") == () and (number := key.to_array().item()) == int(number):
+        key = int(number)  # numpy's numbers of people
     parts = key if type(key) is tuple and len(key) <= 4 else (key,)
     if not all(type(x) in (str, bytes, bool) or (type(x) is int and abs(x) < LARGEST_KEY) for x in parts):
         raise Refused("a dict with keys other than strings and small integers")
@@ -144,6 +146,8 @@ def _build(reader: Any) -> None:
     target = reader.stack[-1]
     if isinstance(target, StandIn):
         target.set_state(state)
+        if isinstance(target, _Joblib):
+            reader.stack[-1] = target.read(reader._file_read)
     elif type(target) is not dict:  # an ordered dict with attributes, which are of no use
         raise Refused("refused a state for what has none")
 
@@ -227,6 +231,20 @@ def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Arra
     return array
 
 
+class _Joblib(StandIn):
+    """What joblib writes for an array, whose bytes follow it in the file: behind a count of others that align them, or none."""
+
+    def read(self, read: Callable[[int], bytes]) -> "_Array":
+        shape, dtype = self.state.get("shape"), self.state.get("dtype")
+        plain = dtype.dtype if isinstance(dtype, _Dtype) else None
+        if plain is None or type(shape) is not tuple or not all(type(n) is int and n >= 0 for n in shape):
+            raise Refused("an array of joblib that is not of numbers")
+        if self.state.get("numpy_array_alignment_bytes") is not None:
+            read(read(1)[0])
+        size = math.prod(shape) * plain.itemsize
+        return _made_array(shape, dtype, self.state.get("order") == "F", read(min(size, 1 << 62)))
+
+
 def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
         raise Refused("refused to encode anything but latin1")
@@ -289,8 +307,10 @@ class _ChumpySelection(StandIn):
         return source.ravel()[_numbers(self.state["idxs"])].reshape(self.state["preferred_shape"])
 
 
-_NAMES: dict[tuple[str, str], Any] = {
+NAMES: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _Array,  # a class that is only named
+    ("joblib.numpy_pickle", "NumpyArrayWrapper"): Call(_Joblib),
+    ("collections", "defaultdict"): Call(lambda *_: {}),
     ("numpy", "dtype"): Call(_dtype),
     **{
         (f"numpy.{core}.{module}", name): Call(function)
@@ -303,7 +323,7 @@ _NAMES: dict[tuple[str, str], Any] = {
     },
     ("_codecs", "encode"): Call(_encode),
     **{(module, "_reconstructor"): Call(lambda cls, *_: _instance(cls)) for module in ("copyreg", "copy_reg")},
-    **{(module, "object"): object for module in ("builtins", "__builtin__")},  # only named, too
+    **{(m, name): object for m in ("builtins", "__builtin__") for name in ("object", "dict", "list", "int", "float")},
     ("scipy.sparse", "csc_matrix"): Call(_SparseColumns),
     ("scipy.sparse", "csr_matrix"): Call(_SparseRows),
     ("scipy.sparse", "coo_matrix"): Call(_Sparse),
@@ -318,12 +338,20 @@ def _instance(cls: Any) -> StandIn:
     return cls.function()
 
 
+def objects(value: Any) -> Any:
+    """The list in an array of Python objects, or the one that it holds; everything else as it is."""
+    held = value.state.get("data") if isinstance(value, _Array) else None
+    if not isinstance(held, list):
+        return value
+    return held[0] if value.state.get("shape") == () and len(held) == 1 else held
+
+
 def as_array(value: Any) -> np.ndarray:
-    """A full array from what `read_pickle` returned: array, number, list of numbers or stand-in.
+    """A full array from what `read_pickle` returned: array, number, list of numbers or stand-in (with a method `to_array`).
 
     Raises: ValueError for anything else.
     """
-    if isinstance(value, StandIn) and hasattr(value, "to_array"):
+    if hasattr(value, "to_array"):
         try:
             return value.to_array()
         except (KeyError, TypeError, IndexError, AttributeError) as error:
@@ -363,7 +391,7 @@ def read_pickle(path: str | Path) -> dict[str, Any]:
     """
     with reading(path, "pickle"):
         data = io.BytesIO(read_bytes(path, "array_bytes"))
-        content = RestrictedUnpickler(data, _NAMES, "it is not needed to hold arrays").load()
+        content = RestrictedUnpickler(data, NAMES, "it is not needed to hold arrays").load()
         if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
             raise Refused(f"expected a dict of arrays by name, got {type(content).__name__}")
         return content

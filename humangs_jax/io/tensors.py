@@ -10,6 +10,7 @@ a stream: three pickles of a magic number, a version and the byte order; the pic
 then of each storage the count of its numbers and the numbers.
 """
 
+import functools
 import io
 import math
 import mmap
@@ -17,15 +18,15 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.io.npz import open_archive
-from humangs_jax.io.reading import Refused, check_limit, open_file, reading, shown
-from humangs_jax.io.restricted_pickle import Call, RestrictedUnpickler
+from humangs_jax.io.npz import open_archive, read_header
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, limits, open_file, read_bytes, reading, shown
+from humangs_jax.io.restricted_pickle import NAMES, Call, RestrictedUnpickler, objects
 
 ZIP_START = b"PK\x03\x04"
 PICKLE_START = b"\x80"
@@ -72,6 +73,8 @@ class _Storage(NamedTuple):
     kind: str
     name: str
     start: int = 0
+    held: Mapping[str, Any] | None = None
+    """The bytes of all storages by name, where they are read with the pickle."""
 
     @property
     def dtype(self) -> np.dtype:
@@ -86,6 +89,13 @@ class _Tensor(NamedTuple):
     offset: int
     shape: tuple[int, ...]
     strides: tuple[int, ...]
+
+    def to_array(self) -> np.ndarray:
+        """For `as_array`, of a tensor whose storage is held."""
+        held = self.storage.held or {}
+        if self.storage.name not in held:
+            raise Refused(f"storage {self.storage.name} of a tensor is missing")
+        return _read_tensor(np.frombuffer(held[self.storage.name], self.storage.dtype), "a tensor", self)
 
 
 def _counts(x: Any) -> bool:
@@ -133,9 +143,12 @@ _NAMES: dict[tuple[str, str], Any] = {
 class _StateDictUnpickler(RestrictedUnpickler):
     """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it read."""
 
-    def __init__(self, file: Any) -> None:
-        super().__init__(file, _NAMES, "no part of a state dict")
+    def __init__(self, file: Any, held: Mapping[str, Any] | None = None, names: Mapping = _NAMES) -> None:
+        super().__init__(
+            file, names, "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays"
+        )
         self.kinds: dict[str, str] = {}
+        self.held = held
 
     def persistent_load(self, pid: Any) -> _Storage:
         """A storage. The older format adds None, or says which part of another storage this one is."""
@@ -146,10 +159,10 @@ class _StateDictUnpickler(RestrictedUnpickler):
             raise Refused(f"storage {pid[2]} is of two types")
         part = pid[5] if len(pid) == 6 else None
         if part is None:
-            return _Storage(pid[1].name, pid[2])
+            return _Storage(pid[1].name, pid[2], 0, self.held)
         if not (type(part) is tuple and len(part) == 3 and _counts(part[1:])):
             raise Refused("a part of a storage whose place is no count")
-        return _Storage(pid[1].name, pid[2], part[1])
+        return _Storage(pid[1].name, pid[2], part[1], self.held)
 
 
 def _state_dict_tensors(content: Any, wanted: Callable[[str], bool]) -> tuple[dict[str, _Tensor], int]:
@@ -215,7 +228,8 @@ def read_torch_file(path: str | os.PathLike, wanted: Wanted = everything) -> tup
             return _read_archive(archive, size, wanted)
 
 
-def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+def _archived_pickle(archive: zipfile.ZipFile, size: int) -> tuple[io.BytesIO, str]:
+    """The pickle in an archive, and what the names of its members begin with."""
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
         raise Refused(f"its members unpack to more than {LARGEST_RATIO} times the size of the file")
     names = set(archive.namelist())
@@ -226,8 +240,12 @@ def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[
     if f"{root}byteorder" in names and archive.read(f"{root}byteorder").strip() != b"little":
         raise Refused("only little-endian checkpoints are supported")
     check_limit("text_bytes", archive.getinfo(pickles[0]).file_size, "bytes of a pickle")
-    content = _StateDictUnpickler(io.BytesIO(archive.read(pickles[0]))).load()
-    tensors, skipped = _state_dict_tensors(content, wanted)
+    return io.BytesIO(archive.read(pickles[0])), root
+
+
+def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+    file, root = _archived_pickle(archive, size)
+    tensors, skipped = _state_dict_tensors(_StateDictUnpickler(file).load(), wanted)
 
     def read(key: str, storage: _Storage) -> np.ndarray:
         try:
@@ -238,7 +256,8 @@ def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[
     return _read_tensors(tensors, size, read), skipped
 
 
-def _read_stream(file: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+def _check_stream(file: Any) -> None:
+    """The three pickles before that of the content."""
     if _StateDictUnpickler(file).load() != MAGIC_NUMBER:
         raise Refused("a pickle, but neither of the formats that torch.save writes")
     if (version := _StateDictUnpickler(file).load()) != STREAM_VERSION:
@@ -246,6 +265,10 @@ def _read_stream(file: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     machine = _StateDictUnpickler(file).load()
     if not (isinstance(machine, dict) and machine.get("little_endian") is True):
         raise Refused("only little-endian checkpoints are supported")
+
+
+def _read_stream(file: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+    _check_stream(file)
     unpickler = _StateDictUnpickler(file)
     tensors, skipped = _state_dict_tensors(unpickler.load(), wanted)
     places = _storage_places(file, size, unpickler.kinds)
@@ -320,3 +343,76 @@ def read_safetensors(path: str | os.PathLike, wanted: Wanted = everything) -> tu
             keys = list(file.keys())
             tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}
             return tensors, len(keys) - len(tensors), file.metadata() or {}
+
+
+# Values of any kind ---------------------------------------------------------------------------------------------------
+
+STREAM_START = b"\x8a\x0a" + MAGIC_NUMBER.to_bytes(10, "little")
+"""The magic number in the first pickle of the older format, behind the protocol."""
+COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b")
+"""How zlib's streams and gzip's begin, in which joblib writes."""
+
+
+def read_values(path: str | os.PathLike) -> Any:
+    """What a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts, lists and what `as_array` takes.
+
+    Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
+    """
+    with reading(path, "pickle"):
+        data = read_bytes(path, "array_bytes")
+        if data[:2] in COMPRESSED:
+            most = max(limits().plain_bytes, limits().ratio * len(data))
+            unpacked = zlib.decompressobj(47).decompress(data, most + 1)
+            check_unpacked(len(data), len(unpacked))
+            data = unpacked
+        file, held = io.BytesIO(data), {}
+        if data.startswith(ZIP_START):
+            with open_archive(file, len(data)) as archive:
+                content, root = _archived_pickle(archive, len(data))
+                start = f"{root}data/"
+                held = {
+                    name.removeprefix(start): archive.read(name)
+                    for name in archive.namelist()
+                    if name.startswith(start)
+                }
+                return _values(content, held)
+        if data.startswith(np.lib.format.MAGIC_PREFIX):
+            if not read_header(file)[2].hasobject:
+                raise Refused("a single array: expected a dict of arrays by name")
+            return objects(_values(file, held))
+        if data[2:14] == STREAM_START:
+            _check_stream(file)
+            return _stream_values(file, len(data), held, _names())
+        return _values(file, held)
+
+
+def _values(file: Any, held: Mapping[str, Any]) -> Any:
+    return _StateDictUnpickler(file, held, _names()).load()
+
+
+def _names() -> dict[tuple[str, str], Any]:
+    """Arrays and tensors. A plain pickle has a file of the older format for each storage; the same bytes are read once."""
+    of_bytes = Call(functools.cache(_storage_of_bytes))
+    more = {("torch.storage", "_load_from_bytes"): of_bytes, ("torch", "device"): Call(lambda *_: None)}
+    return NAMES | _NAMES | more
+
+
+def _stream_values(file: Any, size: int, held: dict[str, Any], names: Mapping) -> Any:
+    """The content of a stream, behind the check; fills `held`."""
+    unpickler = _StateDictUnpickler(file, held, names)
+    content = unpickler.load()
+    for name, (start, count) in _storage_places(file, size, unpickler.kinds).items():
+        file.seek(start)
+        held[name] = file.read(count * _Storage(unpickler.kinds[name], name).dtype.itemsize)
+    return content
+
+
+def _storage_of_bytes(data: Any) -> _Storage:
+    if type(data) is not bytes:
+        raise Refused("a storage that is not of bytes")
+    file = io.BytesIO(data)
+    _check_stream(file)
+    storage = _stream_values(file, len(data), {}, _NAMES)
+    if not isinstance(storage, _Storage):
+        raise Refused("a storage of a tensor that is none")
+    return storage

@@ -273,7 +273,8 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
         load_motion(tmp_path / "far.npz")
     (tmp_path / "walk.fbx").write_text("Kaydara")
     with pytest.raises(
-        MotionError, match=r"expected a file .npz, .pkl, .pickle, .json, .bvh, .glb or a folder, got .fbx"
+        MotionError,
+        match=r"expected a file .npz, .pkl, .pickle, .pt, .pth, .npy, .smpl, .json, .bvh, .glb, .vrma or a folder, got .fbx",
     ):
         load_motion(tmp_path / "walk.fbx")
 

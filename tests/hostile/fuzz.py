@@ -76,7 +76,8 @@ CONSTANTS = [b"J" + struct.pack("<i", n) for n in (-1, 0, 7, 2**31 - 1)]
 CONSTANTS += [b"N", b"}", b"]", b")", b"X\1\0\0\0<", b"\x88"]
 NAMES = """numpy dtype, numpy ndarray, numpy.core.multiarray _reconstruct, numpy.core.multiarray scalar, numpy._core.numeric
 _frombuffer, _codecs encode, scipy.sparse csc_matrix, chumpy.ch Ch, chumpy.reordering Select, copyreg _reconstructor, collections
-OrderedDict, torch FloatStorage, torch._utils _rebuild_tensor_v2, torch._utils _rebuild_parameter, os system, builtins object"""
+OrderedDict, torch FloatStorage, torch.storage _load_from_bytes, joblib.numpy_pickle NumpyArrayWrapper, collections
+defaultdict, torch._utils _rebuild_tensor_v2, torch._utils _rebuild_parameter, os system, builtins object"""
 NAMES = [each.split() for each in NAMES.split(",")]
 
 
@@ -287,15 +288,15 @@ def mutated_safetensors(data, draw):
 
 
 KINDS = {
-    mutated_npz: "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, joints npz, fit record, bank, "
-    "video poses, scene arrays",
-    mutated_json: "json, configuration, transforms, opencv json, openpose, coco, coco annotations, mmpose, lhm, joints json, "
-    "manifest, capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set, preprocessed scene, "
-    "skipped subject",
-    mutated_pickle: "pickle, smplx pkl, aist, thuman fit",
+    mutated_npz: "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, human3r, smplcodec, sam 3d, "
+    "joints npz, fit record, bank, video poses, scene arrays",
+    mutated_json: "easymocap motion, json, configuration, transforms, opencv json, openpose, coco, coco annotations, mmpose, "
+    "lhm, joints json, manifest, capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set, "
+    "preprocessed scene, skipped subject",
+    mutated_pickle: "pickle, smplx pkl, aist, phalp, thuman fit",
     mutated_text: "opencv yaml, easymocap, colmap, obj, off, log, bvh, missing photos, actorshq, thuman mesh, thuman scan",
     mutated_png: "image",
-    mutated_zip: "torch zip",
+    mutated_zip: "torch zip, gvhmr",
     mutated_glb: "glb, glb motion",
     mutated_safetensors: "safetensors, weights",
 }

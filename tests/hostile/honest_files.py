@@ -252,6 +252,30 @@ def lhm():
     return json.dumps({key: np.zeros(shape).tolist() for key, shape in parts.items()})
 
 
+def phalp():
+    pose = {"global_orient": np.eye(3)[None], "body_pose": np.tile(np.eye(3), (23, 1, 1))}
+    return {f"{i}.jpg": {"tid": [1], "smpl": [pose], "camera": [np.zeros(3)]} for i in range(3)}
+
+
+TRAM = {"pred_rotmat": np.tile(np.eye(3), (3, 24, 1, 1)), "pred_trans": np.zeros((3, 1, 3)), "frame": np.arange(3)}
+
+
+def mhr():
+    points = np.random.default_rng(3).normal(size=(2, 127, 3))
+    return {
+        "pred_joint_coords": points,
+        "pred_cam_t": np.zeros((2, 3)),
+        "pred_global_rots": np.tile(np.eye(3), (2, 127, 1, 1)),
+    }
+
+
+def write_easymocap_motion(folder):
+    person = {"id": 0, "Rh": [[0.0, 0, 0]], "Th": [[0.0, 0, 1]], "poses": [[0.0] * 72], "shapes": [[0.0] * 10]}
+    for i in range(3):
+        (folder / f"{i:06d}.json").write_text(json.dumps([person]))
+    return folder
+
+
 def write_glb_motion(path):
     """A skeleton of CMU's names whose hips turn in two frames."""
     rest, names, writer = shipped_joints(), bvh_files.CMU, GlbWriter()

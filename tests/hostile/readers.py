@@ -14,6 +14,7 @@ import dataset_files
 import honest_files as honest
 import numpy as np
 from honest_files import data_set, npz, saved, written
+from joblib_files import joblib
 from PIL import Image
 from safetensors.numpy import save_file
 from torch_writer import tensors, write_checkpoint, write_stream
@@ -167,6 +168,8 @@ scans = data_set(dataset_files.write_thuman, honest.MODEL, kinds="C")
 dna = honest.write_dna if importlib.util.find_spec("h5py") else None
 AIST = {"smpl_poses": np.zeros((3, 72)), "smpl_trans": np.zeros((3, 3)), "smpl_scaling": np.ones(1)}
 AMASS = zeros(poses=(3, 156), trans=(3, 3)) | {"mocap_framerate": 120.0}
+PARTS = zeros(global_orient=(3, 3), body_pose=(3, 63), transl=(3, 3))
+WHAM = zeros(pose_world=(3, 72), trans_world=(3, 3), frame_ids=(3,)) | {"frame_ids": np.arange(3)}
 JOINTS = {"left_hip": [0, 1, 0], "right_hip": [0.2, 1, 0], "neck": [0.1, 1.5, 0]}
 RIG = {n: {"K": honest.K, "R": np.diag([1, -1, -1]).tolist(), "T": [0, 1, 3], "imgSize": [9, 9]} for n in "ab"}
 WORLD_FROM_SCAN = np.diag([2.0, 2, 2, 1]).tolist()
@@ -207,8 +210,26 @@ ROWS = {
     "motion npz": (load_motion, npz("m.npz", honest.motion_arrays)),
     "amass": (load_motion, npz("m.npz", lambda: AMASS)),
     "aist": (load_motion, written("m.pkl", pickled(lambda: AIST))),
-    "thuman": (load_motion, npz("m.npz", lambda: zeros(global_orient=(3, 3), body_pose=(3, 63), transl=(3, 3)))),
+    "thuman": (load_motion, npz("m.npz", lambda: PARTS)),
     "lhm": (load_motion, written("m.json", honest.lhm)),
+    "wham": (load_motion, written("m.pkl", lambda: joblib({0: WHAM}))),
+    "phalp": (load_motion, written("m.pkl", pickled(honest.phalp))),
+    "gvhmr": (load_motion, saved("m.pt", lambda path: write_checkpoint(path, {"smpl_params_global": tensors(PARTS)}))),
+    "gvhmr stream": (
+        load_motion,
+        saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)})),
+    ),
+    "tram": (load_motion, saved("m.npy", lambda path: np.save(path, honest.TRAM, allow_pickle=True))),
+    "human3r": (
+        load_motion,
+        npz("m.npz", lambda: zeros(rotvec=(1, 53, 3), transl=(1, 3), smpl_id=(1,)) | {"cam2world": np.eye(4)}),
+    ),
+    "smplcodec": (
+        load_motion,
+        saved("m.npz", lambda path: np.savez(path, bodyPose=np.zeros((3, 22, 3)), frameRate=24.0)),
+    ),
+    "sam 3d": (load_motion, npz("m.npz", honest.mhr)),
+    "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
     "glb motion": (load_motion, saved("m.glb", honest.write_glb_motion)),
     "obj": (colored_mesh, honest.write_obj),

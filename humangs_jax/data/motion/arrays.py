@@ -1,187 +1,281 @@
-"""Motions in files of arrays: the keys decide the format (`data.formats`), one function for each kind of keys.
+"""Motions in files of arrays: the keys decide the format (`data.formats`), whose rows say what is under them.
 
 SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole hands; 22 (66) are the body.
-What a file does not have (fingers, eyes) is 0.
+Rotations are axis-angles or matrices (three times as many numbers). What a file does not have (fingers, eyes) is 0.
 """
 
-import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.model import JOINT_NAMES
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.formats import MOTIONS, ArrayKeys
+from humangs_jax.data.formats import PLACES, ArrayKeys
+from humangs_jax.data.motion import skeleton
+from humangs_jax.data.motion.mhr import clip_of_points
 from humangs_jax.data.motion.motion import MotionError, Poses, Reading
-from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, HAND_NUMBERS, MILLIMETRES
+from humangs_jax.data.motion.people import SHOWN, Person, expected, format_of, read_people
+from humangs_jax.data.motion.rules import (
+    COLUMNS,
+    HAND_NUMBERS,
+    MILLIMETRES,
+    NO_PLACES,
+    NO_RATE,
+    ORTHONORMAL,
+    PELVIS,
+    joint_places,
+)
 from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.reading import read_json
+from humangs_jax.io.restricted_pickle import as_array
+from humangs_jax.io.tensors import read_values
+
+HEAD = JOINT_NAMES.index("head")
+Rotations = Float[np.ndarray, "m n 3"]
+"""Axis-angles of the frames."""
+NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
 
 
-def read_arrays(path: Path, options: Reading) -> Poses:
-    """The poses of a file. Raises: MotionError, naming the key."""
-    file, known = _MotionFile(path, options), [each.arrays for each in MOTIONS.values() if each.arrays is not None]
-    for form in known:
-        if all(key in file.values for key in form.keys):
-            rotations, translations = _READERS[form.kind](file, form)
-            return Poses(rotations, translations, file.rate(form.rates, form.fps), form.up, form.fixed, form.also)
-    expected = ", ".join(dict.fromkeys(form.keys[0] for form in known))
-    keys = ", ".join(sorted(file.values)) or "none"
-    raise MotionError(path, "", f"no motion: expected one of the keys {expected}, got {keys}")
+def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
+    """The poses of one person. Raises: MotionError, naming the key."""
+    person = _chosen(path, read_people(path, MotionError), options.person)
+    file, form = _MotionFile(path, person, options), format_of(person.values)
+    assert form is not None
+    if form.kind == "points":
+        return clip_of_points(file, file.rate(form))
+    rotations = _whole(file, form) if form.kind == "ours" else _posed(file, form)
+    moves = _placed(file, form, rotations)
+    frames = person.frames if person.frames is not None and len(person.frames) == len(rotations) else None
+    rate = file.rate(form)
+    return Poses(rotations, moves, rate, form.up, form.fixed, form.also, frames, "; ".join(file.said))
 
 
-# Formats ---------------------------------------------------------------------------------------------------------------
+def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
+    if not people:
+        raise MotionError(path, "", expected({}))
+    names = [person.name for person in people]
+    if number is None and len(people) == 1:
+        return people[0]
+    if number is not None:
+        if str(number) in names:
+            return people[names.index(str(number))]
+        if 0 <= number < len(people) and not any(name.isdigit() for name in names):
+            return people[number]
+    counted = ", ".join(f"{person.name or 0} ({_frames(person)} frames)" for person in people[:SHOWN])
+    more = ", ..." if len(people) > SHOWN else ""
+    if number is not None:
+        raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}{more}")
+    raise MotionError(path, "", f"{len(people)} people: {counted}{more}: expected person, the number of one of them")
 
 
-Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]
-"""Rotations and translations of the frames."""
+def _frames(person: Person) -> int:
+    form = format_of(person.values)
+    return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys) if form else 0
 
 
-def _ours(file: "_MotionFile", form: ArrayKeys) -> Moves:
-    key = form.poses[0]
+# Rotations ------------------------------------------------------------------------------------------------------------
+
+
+def _whole(file: "_MotionFile", form: ArrayKeys) -> Rotations:
+    """Of our own format, of any number of joints."""
+    (key,) = form.poses.values()
     if not file.flat_hand_mean:
         raise MotionError(file.path, key, "our own format holds whole rotations: expected flat_hand_mean=True")
-    rotations = file.numbers(key, (None, None, 3))
-    return rotations, file.numbers(form.moves[0], (len(rotations), 3))
+    return file.numbers(key, (None, None, 3))
 
 
-def _whole(file: "_MotionFile", form: ArrayKeys) -> Moves:
-    key = form.poses[0]
-    poses = file.numbers(key, None)
-    count, columns = len(poses), poses[0].size
-    if poses.ndim not in (2, 3) or columns not in COLUMNS:
-        expected = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
-        joints = f", {columns // 3} joints" if columns % 3 == 0 else ""
-        raise MotionError(file.path, key, f"expected {expected} numbers a frame, got shape {poses.shape}{joints}")
-    poses = poses.reshape(count, columns)
-    if columns == 3 * len(JOINT_NAMES):
-        body_and_face, *hands = np.split(poses, [columns - 2 * HAND_NUMBERS, columns - HAND_NUMBERS], axis=1)
-        hands = [file.with_mean(hand, side) for side, hand in enumerate(hands)]
-        rotations = np.concatenate([body_and_face, *hands], axis=1).reshape(count, -1, 3)
+def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
+    """(m, 55, 3) of all places."""
+    rotations: Rotations | None = None
+    count = None
+    for place, key in form.poses.items():
+        if key not in file.values and count is not None:
+            continue
+        first = PLACES[place][0]
+        part = _part(file, form, place, key, count)
+        if rotations is None:
+            count = len(part)
+            rotations = np.zeros((count, len(JOINT_NAMES), 3))
+        if form.pivot == "origin" and place == "all":  # the root's own rotation, before that about the origin
+            part = part.copy()
+            part[:, 0] = (Rotation.from_rotvec(rotations[:, 0]) * Rotation.from_rotvec(part[:, 0])).as_rotvec()
+        rotations[:, first : first + part.shape[1]] = part
+    assert rotations is not None
+    return rotations
+
+
+def _part(file: "_MotionFile", form: ArrayKeys, place: str, key: str, count: int | None) -> Rotations:
+    """(m, n, 3) of the joints of a place."""
+    values = file.numbers(key, None)
+    most = PLACES[place][1]
+    if count is None:
+        single = place == "root" and values.shape == (3, 3) and _orthonormal(values[None])
+        count = 1 if single or values.ndim == 1 else len(values)
+    flat = values.reshape(count, -1) if count == 1 or (values.ndim and len(values) == count) else None
+    if place in ("left_hand", "right_hand", "hands"):
+        return _hands(file, place, key, values, flat, count)
+    if place == "all":
+        return _all(file, form, key, values, flat)
+    for joints in (most, most + 2 if place in ("limbs", "body") else most):
+        if flat is not None and flat.shape[1] in (3 * joints, 9 * joints):
+            return _axis_angles(file, key, flat, joints)[:, :most]
+    of_smpl = f", or ({count}, {3 * most + 6}) of SMPL" if place in ("limbs", "body") else ""
+    raise MotionError(file.path, key, f"expected shape ({count}, {3 * most}){of_smpl}, got {values.shape}")
+
+
+def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, flat: np.ndarray | None) -> Rotations:
+    """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the fingers."""
+    width = 0 if flat is None else flat.shape[1]
+    if flat is not None and form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
+        pose = flat.reshape(len(flat), 53, 3)
+        return np.concatenate([pose[:, :22], pose[:, 52:], np.zeros_like(pose[:, :2]), pose[:, 22:52]], axis=1)
+    if (
+        flat is not None and form.pivot == "origin" and width in (69, 78, 87)
+    ):  # without the root; with coefficients of hands
+        if width == 69:
+            return np.pad(flat, ((0, 0), (3, 0))).reshape(len(flat), -1, 3)[:, :22]
+        file.said.append(NO_HANDS.format(6))
+        return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(len(flat), -1, 3)
+    if flat is not None and width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
+        joints = width // 3 if width in (75, *COLUMNS) else width // 9
+        pose = _axis_angles(file, key, flat, joints)
+        if joints < 52:  # the last two of 24 are whole hands, the last three of 25 jaw and eyes
+            return pose if joints == 25 else pose[:, :22]
+        face = pose[:, 22:25] if joints == len(JOINT_NAMES) else np.zeros((len(pose), 3, 3))
+        return np.concatenate([pose[:, :22], face, pose[:, -30:] + file.means], axis=1)
+    words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
+    joints = f", {width // 3} joints" if width % 3 == 0 else ""
+    raise MotionError(file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}")
+
+
+def _hands(
+    file: "_MotionFile", place: str, key: str, values: np.ndarray, flat: np.ndarray | None, count: int
+) -> Rotations:
+    """Of one hand or both: fewer numbers are principal coefficients."""
+    first, joints = PLACES[place]
+    width, side = 0 if flat is None else flat.shape[1], int(place == "right_hand")
+    if flat is not None and width in (3 * joints, 9 * joints):
+        pose = _axis_angles(file, key, flat, joints)
+    elif flat is not None and joints == 15 and 0 < width < HAND_NUMBERS:
+        if file.hands is None:
+            problem = f"{width} numbers are principal coefficients: they need the hand basis of a model (hands)"
+            raise MotionError(file.path, key, problem)
+        pose = (flat @ np.asarray(file.hands.components)[side, :width]).reshape(-1, 15, 3)
     else:
-        # 66: body. 72: SMPL, whose last two joints are whole hands; we have fingers in their place. 156: body and fingers
-        hands = np.split(poses[:, BODY_NUMBERS:], 2, axis=1) if columns == BODY_NUMBERS + 2 * HAND_NUMBERS else None
-        hands = hands and [file.with_mean(hand, side) for side, hand in enumerate(hands)]
-        rotations = file.assemble(poses[:, :BODY_NUMBERS], hands=hands)
-    return rotations, file.numbers(file.first(form.moves), (count, 3))
+        raise MotionError(file.path, key, f"expected shape ({count}, {3 * joints}), got {values.shape}")
+    return pose + file.means[first - 25 :][:joints]
 
 
-def _scaled(file: "_MotionFile", form: ArrayKeys) -> Moves:
-    key = form.poses[0]
-    poses = file.numbers(key, None)
-    poses = poses.reshape(len(poses), -1) if poses.ndim == 3 else poses
-    if poses.ndim != 2 or poses.shape[1] != 72:
-        raise MotionError(file.path, key, f"expected shape (frames, 72), got {poses.shape}")
-    scale = MILLIMETRES
-    if form.scaling is not None and form.scaling in file.values:
-        scale = float(file.numbers(form.scaling, None).reshape(-1)[0])
+def _orthonormal(matrices: Float[np.ndarray, "*n 3 3"]) -> bool:
+    squares = matrices @ np.swapaxes(matrices, -1, -2)
+    return bool(np.abs(squares - np.eye(3)).max(initial=0) < ORTHONORMAL and (np.linalg.det(matrices) > 0).all())
+
+
+def _axis_angles(file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int) -> Rotations:
+    """(m, joints, 3) from as many axis-angles or matrices."""
+    if flat.shape[1] == 3 * joints:
+        return flat.reshape(len(flat), joints, 3)
+    matrices = flat.reshape(-1, 3, 3)
+    if not _orthonormal(matrices):
+        raise MotionError(
+            file.path, key, f"expected rotation matrices, got others than rotations in shape {flat.shape}"
+        )
+    return Rotation.from_matrix(matrices).as_rotvec().reshape(len(flat), joints, 3)
+
+
+# Positions ------------------------------------------------------------------------------------------------------------
+
+
+def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float[np.ndarray, "m 3"]:
+    """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
+    count, key = len(rotations), file.first(form.moves)
+    if key not in file.values and form.stays and key not in file.pickled:
+        file.said.append(NO_PLACES.format(", ".join(form.moves[:3])))
+        return np.zeros((count, 3))
+    moves = file.numbers(key, None)
+    if moves.size == 4 * count and moves.shape[0] == count:  # a weak perspective: scales, then metres beside the axis
+        file.said.append(f"{key} does not tell how far away people are: they stay at one distance")
+        moves = np.concatenate([moves.reshape(count, 4)[:, 2:], np.zeros((count, 1))], axis=1)
+    if moves.size != 3 * count or moves.shape[-1] != 3 or (count > 1 and len(moves) != count):
+        raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
+    moves = moves.reshape(count, 3)
+    if form.scaling is not None:
+        scale = float(file.numbers(form.scaling, None).reshape(-1)[0]) if form.scaling in file.values else MILLIMETRES
         if not scale > 0:
             raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
-    return file.assemble(poses[:, :BODY_NUMBERS]), file.numbers(form.moves[0], (len(poses), 3)) / scale
+        moves = moves / scale
+    if form.pivot == "origin":
+        return (
+            moves
+            + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(PELVIS)
+            - PELVIS
+        )
+    if form.pivot == "head":
+        joints = skeleton.shipped_joints()
+        moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, HEAD]
+    camera = _cameras(file, count)
+    if camera is None:
+        return moves
+    turns, places = camera
+    rotations[:, 0] = (Rotation.from_matrix(turns) * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
+    return np.einsum("mab,mb->ma", turns, moves + PELVIS) + places - PELVIS
 
 
-def _parts(file: "_MotionFile", form: ArrayKeys) -> Moves:
-    root, body, *others = form.poses
-    orient = file.numbers(root, None)
-    count = len(orient)
-    orient = file.numbers(root, (count, 3))
-    given = file.numbers(body, None)
-    pose = given.reshape(len(given), -1)
-    if pose.shape not in ((count, BODY_NUMBERS - 3), (count, 69)):  # 69: SMPL, whose last two joints are whole hands
-        expected = f"expected shape ({count}, {BODY_NUMBERS - 3}), or ({count}, 69) of SMPL"
-        raise MotionError(file.path, body, f"{expected}, got {given.shape}")
-    pose = np.concatenate([orient, pose[:, : BODY_NUMBERS - 3]], axis=1)
-    face = [file.optional(key, (count, 3)) for key in others[:3]]
-    hands = [file.hand(key, count, side) for side, key in enumerate(others[3:])]
-    return file.assemble(pose, face, hands), file.numbers(form.moves[0], (count, 3))
-
-
-_READERS = {"ours": _ours, "whole": _whole, "scaled": _scaled, "parts": _parts}
+def _cameras(file: "_MotionFile", count: int) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
+    """Rotations and places of the cameras in the world for each frame, where files tell; None: they do not."""
+    if "cam2world" in file.values:
+        matrices = file.numbers("cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)).reshape(
+            -1, 4, 4
+        )
+        turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
+    elif "pred_rotmat" in file.values:
+        folders = (file.path, *file.path.parents[:2])
+        beside = next((each / "camera.npy" for each in folders if (each / "camera.npy").is_file()), None)
+        if beside is None:
+            file.said.append("no camera.npy beside it: people move as the camera sees them")
+            return None
+        camera = ArrayFile(beside, read_values(beside), error=MotionError)
+        own = file.numbers(file.first(("frame", "frames")), (count,)).astype(int)
+        kind = "world" if "world_cam_R" in camera else "pred"
+        turns, places = camera.numbers(f"{kind}_cam_R", (None, 3, 3)), camera.numbers(f"{kind}_cam_T", (None, 3))
+        if own.min() < 0 or own.max() >= min(len(turns), len(places)):
+            raise MotionError(
+                beside, f"{kind}_cam_R", f"expected one for each of {own.max() + 1} frames, got {len(turns)}"
+            )
+        turns, places = turns[own], places[own]
+    else:
+        return None
+    if not _orthonormal(turns):
+        raise MotionError(file.path, "", "expected rotation matrices of cameras")
+    return turns, places
 
 
 class _MotionFile(ArrayFile):
-    """The values of a motion file, and how its hands are written."""
+    """The values of a person, how hands are written, and what is to be said."""
 
-    def __init__(self, path: Path, options: Reading):
-        self.hands, self.flat_hand_mean, self.fps = options
-        if path.is_dir() or path.suffix.lower() == ".json":
-            super().__init__(path, _read_json_frames(path), error=MotionError)
-        else:
-            file = ArrayFile.open(path, MotionError)
-            super().__init__(path, file.values, file.pickled, MotionError)
-
-    def optional(self, key: str, shape: tuple[int | None, ...] | None) -> Float[np.ndarray, "..."] | None:
-        """As `numbers`; None if the file has no such key."""
-        return self.numbers(key, shape) if key in self.values else None
+    def __init__(self, path: Path, person: Person, options: Reading):
+        super().__init__(path, person.values, person.pickled, MotionError)
+        self.hands, self.flat_hand_mean, self.fps = options.hands, options.flat_hand_mean, options.fps
+        added = None if self.flat_hand_mean or self.hands is None else np.asarray(self.hands.means, np.float64)
+        self.means: Float[np.ndarray, "30 3"] = np.zeros((30, 3)) if added is None else added.reshape(30, 3)
+        self.said: list[str] = []
 
     def first(self, keys: tuple[str, ...]) -> str:
         """The first key that the file has; the first of all if it has none."""
         return next((key for key in keys if key in self.values), keys[0])
 
-    def rate(self, keys: tuple[str, ...], default: float | None) -> float:
+    def rate(self, form: ArrayKeys) -> float:
         """Frames per second: those asked for, or under the first of the keys that is there."""
         if self.fps is not None:
             return self.fps
-        key = self.first(keys) if keys else ""
+        key = self.first(form.rates) if form.rates else ""
         if key in self.values:
             rate = float(self.numbers(key, None).reshape(-1)[0])
             if not (rate > 0 and np.isfinite(1 / rate)):
                 raise MotionError(self.path, key, f"expected a positive number of frames per second, got {rate}")
             return rate
-        if default is None:
-            raise MotionError(self.path, key, "missing: how many frames are a second?")
-        return default
-
-    def hand(self, key: str, count: int, side: int) -> Any:
-        """(m, 45) axis-angle numbers of a hand, or None if the file has none."""
-        pose = self.optional(key, None)
-        if pose is None:
-            return None
-        pose = pose.reshape(len(pose), -1)
-        if len(pose) != count or pose.shape[1] > HAND_NUMBERS:
-            raise MotionError(self.path, key, f"expected shape ({count}, {HAND_NUMBERS}), got {pose.shape}")
-        if pose.shape[1] < HAND_NUMBERS:
-            if self.hands is None:
-                problem = (
-                    f"{pose.shape[1]} numbers are principal coefficients: they need the hand basis of a model (hands)"
-                )
-                raise MotionError(self.path, key, problem)
-            pose = pose @ np.asarray(self.hands.components)[side, : pose.shape[1]]
-        return self.with_mean(pose, side)
-
-    def with_mean(self, hand: Any, side: int) -> Any:
-        """A hand's pose (m, 45) from that of a file, which may be relative to the mean hand."""
-        return hand if self.flat_hand_mean or self.hands is None else hand + np.asarray(self.hands.means)[side]
-
-    def assemble(
-        self,
-        body: Float[np.ndarray, "m 66"],
-        face: Sequence[Float[np.ndarray, "m 3"] | None] | None = None,
-        hands: Sequence[Float[np.ndarray, "m 45"] | None] | None = None,
-    ) -> Float[np.ndarray, "m j 3"]:
-        """(m, 55, 3) from (m, 66) and parts that may be None."""
-        zeros = lambda columns: np.zeros((len(body), columns))
-        face = [zeros(3) if part is None else part for part in face or [None] * 3]
-        hands = [zeros(HAND_NUMBERS) if hand is None else hand for hand in hands or [None] * 2]
-        return np.concatenate([body, *face, *hands], axis=1).reshape(len(body), -1, 3)
-
-
-def _read_json_frames(path: Path) -> dict[str, list[Any]]:
-    """One JSON file per frame (a folder: all of them, in the order of their numbers), stacked by key."""
-    files = [path]
-    if path.is_dir():
-        natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
-        files = sorted(path.glob("*.json"), key=natural)
-        if not files:
-            raise MotionError(path, "", "no .json file in this folder")
-    frames = []
-    for file in files:
-        frame = read_json(file)
-        if not isinstance(frame, dict):
-            raise MotionError(file, "", f"expected a JSON object, got {type(frame).__name__}")
-        if missing := set(frames[0] if frames else ()) - set(frame):
-            raise MotionError(file, min(missing), f"missing, but {files[0].name} has it")
-        frames.append(frame)
-    return {key: [frame[key] for frame in frames] for key in frames[0]}
+        if form.fps is None:
+            raise MotionError(self.path, key, "missing: how many frames are a second? expected fps, or this key")
+        if not form.fixed:
+            self.said.append(NO_RATE.format(form.fps))
+        return form.fps

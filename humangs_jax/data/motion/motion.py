@@ -56,14 +56,17 @@ class Motion:
         last = len(self.translations) - 1
         count = max(1, round(min((last + 1) * fps / self.fps, 1e18)))
         check_limit("frames", count, "frames")
-        times = np.minimum(np.arange(count) * self.fps / fps, last)
+        return replace(self._at(np.minimum(np.arange(count) * self.fps / fps, last)), fps=float(fps))
+
+    def _at(self, times: Float[np.ndarray, " n"]) -> "Motion":
+        """The motion at times, in frames."""
         low = np.floor(times).astype(int)
         frames = self.rotations[low], self.translations[low]
         if (times > low).any():
-            high = np.minimum(low + 1, last)
+            high = np.minimum(low + 1, len(self.translations) - 1)
             share = jnp.asarray(times - low, jnp.float32)
             frames = _between(*frames, self.rotations[high], self.translations[high], share)
-        return replace(self, rotations=frames[0], translations=frames[1], fps=float(fps))
+        return replace(self, rotations=frames[0], translations=frames[1])
 
 
 @jax.jit
@@ -86,12 +89,15 @@ class Reading(NamedTuple):
     hands: HandBasis | None = None
     flat_hand_mean: bool = True
     fps: float | None = None
+    person: int | None = None
+    clip: str | None = None
 
 
 class Poses(NamedTuple):
     """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the file, of which `up` is up.
 
     fixed: whatever the poses look like; also: other axes that are up in some files of the format, see `rules.up_axis`.
+    frames: (m,) numbers of the frames, whose gaps are filled; None: one after the other. said: what is to be told of the file.
     """
 
     rotations: Float[np.ndarray, "m j 3"]
@@ -100,6 +106,8 @@ class Poses(NamedTuple):
     up: str = "y"
     fixed: bool = False
     also: tuple[str, ...] = ()
+    frames: np.ndarray | None = None
+    said: str = ""
 
 
 @checked_arguments
@@ -108,6 +116,8 @@ def load_motion(
     *,
     up: str = "auto",
     fps: float | int | None = None,
+    person: int | None = None,
+    clip: str | int | None = None,
     hands: HandBasis | None = None,
     flat_hand_mean: bool = True,
     rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
@@ -121,6 +131,8 @@ def load_motion(
             another only where people stand along that and its floor carries them (`rules.up_axis`), which is logged as a
             warning, and never in our own format, AIST++ and .glb.
         fps: frames per second in place of those in the file.
+        person: the number of the person, in a file of several people. clip: of the animations of a GLB file, its name or number
+            from 0; None: the first.
         hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
             `flat_hand_mean` False, which adds the mean hand (only to hands that a file has). Our own format holds
             whole rotations: there is nothing to add.
@@ -139,7 +151,9 @@ def load_motion(
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
     with reading(path, "motion", MotionError):
-        options = Reading(hands, flat_hand_mean, None if fps is None else float(fps))
+        options = Reading(
+            hands, flat_hand_mean, None if fps is None else float(fps), person, None if clip is None else str(clip)
+        )
         return _load(Path(path), up, options, rest_joints)
 
 
@@ -171,9 +185,30 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     check_limit("rate", rate, "frames per second")
     if rate < SLOWEST:
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
-    if said:
+    motion = Motion(jnp.asarray(rotations), jnp.asarray(translations), rate)
+    if isinstance(found, Poses) and found.frames is not None:
+        motion, filled = _without_gaps(motion, found.frames, path)
+        said = "; ".join(filter(None, (said, filled)))
+    if said := "; ".join(filter(None, (found.said, said))):
         logger.warning("%s: %s", path, said)
-    return Motion(jnp.asarray(rotations), jnp.asarray(translations), rate)
+    return motion
+
+
+def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
+    """The motion with the frames in which nobody was seen, between those before and after, and what is to be said."""
+    steps = np.diff(np.asarray(frames, float))
+    if not len(steps):
+        return motion, ""
+    if not (np.isfinite(steps).all() and (steps > 0).all()):
+        raise MotionError(path, "frames", "expected increasing numbers of frames")
+    step = float(steps.min())
+    count = float(steps.sum()) / step + 1
+    if count <= len(frames) + 0.5 or (steps % step > 1e-6).any():
+        return motion, ""
+    check_limit("frames", count, "frames")
+    every = np.arange(round(count))
+    motion = motion._at(np.interp(every, np.cumsum([0, *steps]) / step, np.arange(len(frames))))
+    return motion, f"nobody in {len(every) - len(frames)} of {len(every)} frames: filled in between"
 
 
 def _reader(path: Path) -> MotionFormat:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.model import BODY_NAMES, FINGERS, JOINT_NAMES, PARENTS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
-from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS
+from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, PLACES
 from humangs_jax.geometry import quaternion
 
 # Files of arrays --------------------------------------------------------------------------------------------------------
@@ -30,6 +30,10 @@ COLUMNS = {
 }
 """Numbers of a pose, by whose joints they are."""
 MILLIMETRES = 1000.0
+ORTHONORMAL = 0.05
+"""R R^T of a rotation matrix in a file is this near to 1."""
+NO_RATE = "the file says no frames per second: taken for {:g}, which fps= changes"
+NO_PLACES = "the file has no positions ({}): people stay in place"
 
 # Names of joints --------------------------------------------------------------------------------------------------------
 
@@ -236,8 +240,11 @@ def turned_upright(
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE SIDES NEXT NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING
-    BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS"""
+    BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS
+    ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
-    rules |= {"DEFAULT_FPS": DEFAULT_FPS, "LARGEST_DISTANCE": LARGEST_DISTANCE}
-    formats = [dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None]
+    rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
+    formats = [
+        dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None and each.arrays.page
+    ]
     return rules | {"PELVIS": PELVIS.tolist(), "COLUMNS": list(COLUMNS), "FORMATS": formats}

@@ -61,7 +61,7 @@ class Clip:
 
     names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the rest pose. turns: (m, s, 3, 3)
     rotation of each joint from the rest pose to the frame, in the world. places: (m, s, 3). fps: frames per second. up: the axis
-    that the format says is up; None: the rest pose tells.
+    that the format says is up; None: the rest pose tells. said: what is to be told of the file.
     """
 
     names: tuple[str, ...]
@@ -71,6 +71,7 @@ class Clip:
     places: Float[np.ndarray, "m s 3"]
     fps: float
     up: str | None = None
+    said: str = ""
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:

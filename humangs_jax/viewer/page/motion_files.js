@@ -10,7 +10,7 @@ async function readMotionFile(file, scene) {
   const bytes = new Uint8Array(await file.arrayBuffer());
   try {
     if (/\.bvh$/i.test(file.name)) return checkedMotion(retargetBvh(parseBvh(new TextDecoder().decode(bytes)), scene));
-    if (/\.npz$/i.test(file.name)) return checkedMotion(motionFromArrays(await readNpz(bytes), scene));
+    if (/\.(npz|smpl)$/i.test(file.name)) return checkedMotion(motionFromArrays(await readNpz(bytes), scene));
   } catch (error) {
     throw new Error(`${file.name}: ${error.message}`);
   }
@@ -98,59 +98,68 @@ function motionFromArrays(arrays, scene) {
   }
   const count = scene.parents.length, full = largest(RULES.COLUMNS);
   if (format.kind !== "ours" && 3 * count !== full) throw new Error(`such files are for ${full / 3} joints, this avatar has ${count}`);
-  const numbers = (key, columns) => {
+  // rows of numbers, of one of some widths
+  const numbers = (key, widths, amount = null) => {
     const found = arrays.get(key);
     if (!found) throw new Error(`key ${key} is missing`);
-    const frames = found.shape[0] || 0, width = found.data.length / Math.max(frames, 1);
-    if (frames < 1 || !columns.includes(width))
-      throw new Error(`key ${key}: expected frames of ${columns.join(" or ")} numbers, got shape (${found.shape})`);
+    const frames = amount === 1 || found.shape.length === 1 ? 1 : found.shape[0] || 0, width = found.data.length / Math.max(frames, 1);
+    if (frames < 1 || !widths.includes(width) || (amount !== null && frames !== amount)) {
+      const wanted = `${amount === null ? "" : `${amount} `}frames of ${widths.join(" or ")} numbers`;
+      throw new Error(`key ${key}: expected ${wanted}, got shape (${found.shape})`);
+    }
     const bad = found.data.findIndex((v) => !Number.isFinite(Math.fround(v)));
     if (bad >= 0) throw new Error(`key ${key}: expected finite numbers, got ${found.data[bad]} in frame ${Math.floor(bad / width)}`);
-    return { frames, row: (f) => [...found.data.subarray(f * width, (f + 1) * width)] };
+    return { frames, width, row: (f) => [...found.data.subarray(f * width, (f + 1) * width)] };
   };
   const first = (keys) => keys.find((key) => arrays.has(key)) ?? keys[0];
-  const poses = POSES[format.kind](format, numbers, arrays, count), moves = numbers(first(format.moves), [3]);
-  if (moves.frames !== poses.frames) throw new Error(`${moves.frames} translations for ${poses.frames} poses`);
-  const rate = first(format.rates), fps = arrays.has(rate) ? arrays.get(rate).data[0] : format.fps;
+  const poses = posesOf(format, numbers, arrays, count), key = first(format.moves);
+  const still = format.stays && !arrays.has(key), moves = still ? null : numbers(key, [3], poses.length);
+  const rate = first(format.rates), given = arrays.has(rate), fps = given ? arrays.get(rate).data[0] : format.fps;
   if (fps === null) throw new Error(`key ${rate}: missing: how many frames are a second?`);
   if (!(fps > 0 && Number.isFinite(fps))) throw new Error(`key ${rate}: expected a positive number of frames per second, got ${fps}`);
   const scale = format.scaling === null ? 1 : arrays.get(format.scaling)?.data[0] ?? RULES.MILLIMETRES;
   if (!(scale > 0)) throw new Error(`key ${format.scaling}: expected a positive number, got ${scale}`);
-  const quats = [], translations = [];
-  for (let f = 0; f < poses.frames; f++) {
-    const row = poses.row(f);
-    quats.push(Array.from({ length: row.length / 3 }, (_, j) => quatFromAxisAngle(...row.slice(3 * j, 3 * j + 3))));
-    translations.push(scaled(moves.row(f), 1 / scale));
-  }
-  return turnedUp({ quats, translations, fps }, format, scene);
+  const translations = poses.map((_, f) => (still ? [0, 0, 0] : scaled(moves.row(f), 1 / scale)));
+  const motion = turnedUp({ quats: poses, translations, fps }, format, scene);
+  const notes = [still && RULES.NO_PLACES.replace("{}", format.moves.slice(0, 3).join(", "))];
+  notes.push(!given && !format.fixed && RULES.NO_RATE.replace("{:g}", fps));
+  return { ...motion, said: [...notes, motion.said].filter(Boolean).join("; ") };
 }
 
-// How the poses of each kind of format (rules.py) become frames of all joints.
-const POSES = {
-  ours: (format, numbers, arrays, count) => numbers(format.poses[0], [3 * count]),
-  whole: (format, numbers) => {
-    const { frames, row } = numbers(format.poses[0], RULES.COLUMNS), { BODY_NUMBERS: body, HAND_NUMBERS: hand } = RULES;
-    const whole = (each) => each.length === largest(RULES.COLUMNS) ? each : each.length === body + 2 * hand
-      ? filledPose(each, [null, null, null, each.slice(body, body + hand), each.slice(body + hand)]) : filledPose(each, []);
-    return { frames, row: (f) => whole(row(f)) };
-  },
-  scaled: (format, numbers) => {
-    const { frames, row } = numbers(format.poses[0], [72]);
-    return { frames, row: (f) => filledPose(row(f), []) };
-  },
-  parts: (format, numbers, arrays) => {
-    const [root, body, ...others] = format.poses, orient = numbers(root, [3]), pose = numbers(body, [RULES.BODY_NUMBERS - 3, 69]);
-    const parts = others.map((key, i) => (arrays.has(key) ? numbers(key, [i < 3 ? 3 : RULES.HAND_NUMBERS]) : null));
-    for (const [i, part] of [pose, ...parts].entries())
-      if (part && part.frames !== orient.frames) throw new Error(`key ${[body, ...others][i]}: expected ${orient.frames} frames, got ${part.frames}`);
-    return { frames: orient.frames, row: (f) => filledPose([...orient.row(f), ...pose.row(f)], parts.map((part) => part?.row(f))) };
-  },
-};
+// Quaternions of all joints in each frame, of the places of a format (PLACES: the first joint, and how many).
+function posesOf(format, numbers, arrays, count) {
+  let frames = null;
+  for (const [place, key] of Object.entries(format.poses)) {
+    if (frames && !arrays.has(key)) continue;
+    const [at, most] = format.kind === "ours" ? [0, count] : RULES.PLACES[place];
+    const counts = place === "all" && format.kind !== "ours" ? RULES.COLUMNS.map((n) => n / 3) : [most];
+    if (place === "limbs" || place === "body") counts.push(most + 2);  // SMPL's last two are whole hands
+    const part = numbers(key, counts.flatMap((n) => (format.kind === "ours" ? [3 * n] : [3 * n, 9 * n])), frames && frames.length);
+    const angles = counts.includes(part.width / 3), joints = part.width / (angles ? 3 : 9);
+    frames ??= Array.from({ length: part.frames }, () => Array.from({ length: count }, () => [1, 0, 0, 0]));
+    frames.forEach((quats, f) => {
+      const row = part.row(f);
+      for (let j = 0; j < joints; j++) {
+        const to = placeOf(j, joints, at, most, place);
+        if (to === null) continue;
+        quats[to] = angles ? quatFromAxisAngle(...row.slice(3 * j, 3 * j + 3)) : quatFromMatrix(rotationMatrix(row.slice(9 * j, 9 * j + 9), key));
+      }
+    });
+  }
+  return frames;
+}
 
-// The body's numbers, then jaw, eyes and hands where there are any.
-function filledPose(body, parts) {
-  const zeros = (i) => new Array(i < 3 ? 3 : RULES.HAND_NUMBERS).fill(0);
-  return [...body.slice(0, RULES.BODY_NUMBERS), ...[0, 1, 2, 3, 4].flatMap((i) => parts[i] || zeros(i))];
+// The joint of ours that the j-th of a part is: of whole poses SMPL-H's fingers follow the body, and SMPL's hands are left out.
+function placeOf(j, joints, at, most, place) {
+  const body = RULES.BODY_NUMBERS / 3, fingers = 2 * RULES.HAND_NUMBERS / 3;
+  if (place !== "all" || joints === most || j < body) return j < most ? at + j : null;
+  return joints === body + fingers ? most - joints + j : null;
+}
+
+function rotationMatrix(m, key) {
+  const square = matrixMultiply(m, transposed(m));
+  if (!square.every((v, i) => Math.abs(v - Number(i % 4 === 0)) < RULES.ORTHONORMAL)) throw new Error(`key ${key}: expected rotation matrices`);
+  return m;
 }
 
 // ---- Which way is up: as humangs_jax/data/motion/world.py --------------------------------------------------------------

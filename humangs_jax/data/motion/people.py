@@ -1,0 +1,255 @@
+"""The people in a file or a folder of a motion, and what it says of each: arrays by name.
+
+Estimators put people into dicts by their number, into a list for each frame, along a first axis, into files of their own, or into
+one file a frame; and what they found of a person into dicts by coordinates. Of these those of the world are taken first.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.data.formats import MOTIONS, ArrayKeys
+from humangs_jax.io.arrays import ArrayFile
+from humangs_jax.io.reading import FileError, check_limit, open_file, read_json
+from humangs_jax.io.restricted_pickle import as_array, objects
+from humangs_jax.io.tensors import read_values
+
+INSIDE = (
+    "smpl_params_global",
+    "smplx_world",
+    "smpl_params_incam",
+    "smplx_cam",
+    "pred_smpl_params",
+    "smpl_params",
+    "smpl",
+)
+"""Keys of what was found of a person, the best first."""
+LISTS = ("people", "persons", "annots", "results")
+"""Keys of all people."""
+IDS = ("id", "smpl_id", "track_id", "personID", "person_id")
+"""Keys of the number of a person."""
+FRAMES = ("frame_ids", "frames", "frame", "frame_id")
+"""Keys of the frames in which a person was seen."""
+FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
+"""Where the files of a folder may lie."""
+OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
+"""Suffixes of files of one person each; others are of one frame each."""
+DEEPEST, SHOWN = 6, 12
+
+
+class Person(NamedTuple):
+    """A person of a file. name: as the file has it. frames: in which the person was seen, None for all."""
+
+    name: str
+    values: Mapping[str, Any]
+    frames: np.ndarray | None = None
+    pickled: tuple[str, ...] = ()
+
+
+def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
+    """The first format whose keys are all there."""
+    rows = (each.arrays for each in MOTIONS.values() if each.arrays is not None)
+    return next((row for row in rows if all(key in values for key in row.keys)), None)
+
+
+def read_people(path: Path, error: type[FileError]) -> list[Person]:
+    """The people of a file or a folder; none if it has nothing of any format. Raises: FileError; `error`."""
+    if not path.is_dir() and path.suffix.lower() != ".json":
+        content, pickled = _content(path, error)
+        if not (people := _people(content, pickled)):
+            raise error(path, "", expected(content if isinstance(content, dict) else {}))
+        return people
+    files = _files(path, error) if path.is_dir() else [path]
+    check_limit("frames", len(files), "files")
+    if files[0].suffix.lower() in OF_ONE:
+        return [person for file in files for person in _of_file(file, _people(*_content(file, error)))]
+    return _stacked(_frames(files, error))
+
+
+def _of_file(file: Path, people: list[Person]) -> list[Person]:
+    """The people of one file of several: a single one has the number of the file."""
+    return [each._replace(name=(_numbers(file) or [file.stem])[-1]) for each in people] if len(people) == 1 else people
+
+
+def _content(file: Path, error: type[FileError]) -> tuple[Any, tuple[str, ...]]:
+    """What is in a file, and which of it is pickled objects."""
+    if file.suffix.lower() == ".json":
+        return read_json(file), ()
+    with open_file(file) as opened:
+        archive = opened.read(2) == b"PK"
+    if (archive or file.suffix.lower() == ".npz") and file.suffix.lower() not in (".pt", ".pth"):
+        found = ArrayFile.open(file, error)
+        return found.values, found.pickled
+    return read_values(file), ()
+
+
+def _files(folder: Path, error: type[FileError]) -> list[Path]:
+    natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
+    for place in (folder / name for name in FOLDERS):
+        for suffix in (".json", ".npz", *OF_ONE):
+            if files := sorted((file for file in place.glob("*" + suffix) if file.name != "camera.npy"), key=natural):
+                return files
+    raise error(folder, "", "no .json, .npz or other file of a motion in this folder")
+
+
+def _numbers(file: Path) -> list[str]:
+    return re.findall(r"\d+", file.stem)
+
+
+# People in values -----------------------------------------------------------------------------------------------------
+
+
+def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
+    """The people in what a file holds."""
+    frames = _listed_frames(content)
+    if frames is not None:
+        return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
+    return [person._replace(frames=_frames_of(person.values), pickled=pickled) for person in _found(content, "", 0)]
+
+
+def _found(content: Any, name: str, depth: int) -> list[Person]:
+    content = objects(content)
+    if depth > DEEPEST:
+        return []
+    if isinstance(content, list | tuple):
+        found = [p for i, each in enumerate(content) for p in _found(each, _id_of(each, i), depth + 1)]
+    elif not isinstance(content, dict):
+        return []
+    elif (form := format_of(content)) is not None:
+        return _split(content, form, name)
+    elif (key := next((key for key in INSIDE if isinstance(content.get(key), dict)), None)) is not None:
+        beside = {other: value for other, value in content.items() if other not in INSIDE}
+        return _found(beside | content[key], name, depth + 1)
+    elif (key := next((key for key in LISTS if isinstance(objects(content.get(key)), dict | list)), None)) is not None:
+        return _found(content[key], name, depth + 1)
+    else:
+        found = [p for key, each in content.items() for p in _found(each, str(key), depth + 1)]
+    check_limit("people", len(found), "people")
+    return found
+
+
+def _id_of(content: Any, number: int) -> str:
+    key = next((key for key in IDS if isinstance(content, dict) and key in content), None)
+    return str(number) if key is None else _word(content[key])
+
+
+def _word(value: Any) -> str:
+    number = np.asarray(as_array(value)).reshape(-1)
+    return f"{number[0]:g}" if number.size == 1 and number.dtype.kind in "iuf" else str(value)[:40]
+
+
+def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
+    """People along the first axis of the arrays of their roots, if they have one more than those of one person."""
+    place, key = next(iter(form.poses.items()))
+    if place not in ("root", "all") or form.kind != "poses" or key not in values:
+        return [Person(name, values)]
+    shape = np.shape(as_array(values[key])) if not isinstance(values[key], list) else ()
+    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not _turns(values[key])
+    several = several or (form.pivot == "head" and len(shape) == 3)
+    if not several:
+        return [Person(name, values)]
+    ids = next((np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0]))
+    arrays = {key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values}
+    ids = ids if len(ids) == shape[0] else np.arange(shape[0])
+    rest = {key: value for key, value in values.items() if key not in arrays}
+    of = lambda array, i: array[i] if place == "root" else array[i : i + 1]
+    own = lambda i: {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}
+    return [Person(str(number), rest | own(i)) for i, number in enumerate(ids.tolist())]
+
+
+def _turns(value: Any) -> bool:
+    """Whether (n, 3, 3) are rotation matrices."""
+    array = np.asarray(as_array(value))
+    if array.shape[1:] != (3, 3) or array.dtype.kind not in "fiu":
+        return False
+    return bool(np.abs(array @ np.swapaxes(array, 1, 2) - np.eye(3)).max(initial=0) < 0.1)
+
+
+def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
+    key = next((key for key in FRAMES if key in values), None)
+    try:
+        return None if key is None else np.ravel(as_array(values[key]))
+    except ValueError:
+        return None
+
+
+# Frames with people ---------------------------------------------------------------------------------------------------
+
+
+def _listed_frames(content: Any) -> list[list[Person]] | None:
+    """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything else."""
+    content = objects(content)
+    if isinstance(content, list) and content and all(isinstance(objects(each), list) for each in content):
+        return [_found(each, "", 1) for each in content]
+    images = list(content.values()) if isinstance(content, dict) else []
+    if not images or not all(isinstance(each, dict) and isinstance(objects(each.get("smpl")), list) for each in images):
+        return None
+    return [_tracked(each) for each in images]
+
+
+def _tracked(image: Mapping[str, Any]) -> list[Person]:
+    """The people that PHALP follows in an image: lists, an entry for each track."""
+    lists = {key: objects(image.get(key)) for key in ("smpl", "tid", "camera")}
+    tracks, cameras = lists["tid"], lists["camera"]
+    people = []
+    for i, values in enumerate(lists["smpl"]):
+        if isinstance(values, dict):
+            name = _word(tracks[i]) if isinstance(tracks, list) and i < len(tracks) else str(i)
+            camera = {"camera": cameras[i]} if isinstance(cameras, list) and i < len(cameras) else {}
+            people.append(Person(name, values | camera))
+    return people
+
+
+def _frames(files: Sequence[Path], error: type[FileError]) -> list[tuple[Path, list[Person]]]:
+    """The people of each frame. A file whose name ends in two numbers, of which the first changes, is of a frame and a person."""
+    numbers = [_numbers(file) for file in files]
+    apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1
+    frames: dict[str, tuple[Path, list[Person]]] = {}
+    for file, number in zip(files, numbers, strict=True):
+        content = _content(file, error)[0]
+        if not isinstance(content, dict | list):
+            raise error(file, "", f"expected a JSON object, got {type(content).__name__}")
+        people = _found(content, "", 0)
+        if apart:
+            people = [person._replace(name=number[-1]) for person in people]
+        frames.setdefault(number[-2] if apart else str(file), (file, []))[1].extend(people)
+        if not people and isinstance(content, dict) and len(files) == 1:
+            raise error(file, "", expected(content))
+    return list(frames.values())
+
+
+def _stacked(frames: Sequence[tuple[Any, list[Person]]]) -> list[Person]:
+    """People of many frames, from those of each."""
+    people: dict[str, list[tuple[int, Any, Mapping[str, Any]]]] = {}
+    for i, (file, found) in enumerate(frames):
+        for person in found:
+            people.setdefault(person.name, []).append((i, file, person.values))
+    stacked = []
+    for name, seen in people.items():
+        (_, first_file, first), form = seen[0], format_of(seen[0][2])
+        assert form is not None
+        keys = [key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first]
+        for _, file, values in seen:
+            if missing := set(keys) - set(values):
+                where = first_file.name if isinstance(first_file, Path) else first_file
+                raise FileError(file, min(missing), f"missing, but {where} has it")
+        values = {key: [objects(values[key]) for _, _, values in seen] for key in keys}
+        values = {
+            k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()
+        }
+        stacked.append(Person(name, values, np.asarray([i for i, _, _ in seen])))
+    return stacked
+
+
+MORE = ("cam2world", "pred_global_rots")
+"""Keys of what is there for each frame, besides poses and positions."""
+
+
+def expected(values: Mapping[Any, Any]) -> str:
+    """What is said of a file of no format."""
+    first = ", ".join(dict.fromkeys(row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None))
+    keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"
+    return f"no motion: expected one of the keys {first}, got {keys}"
