@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.model import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import PELVIS, UPRIGHT, MotionError, load_motion
 from humangs_jax.data.motion.mhr import COUNT, JOINTS
 from humangs_jax.data.motion.rules import joint_places
@@ -370,8 +370,6 @@ def mhr(rots=True, frames=FRAMES):
     points, turns = np.zeros((FRAMES, COUNT, 3)), np.tile(np.eye(3), (FRAMES, COUNT, 1, 1))
     own = Rotation.random(COUNT, random_state=2).as_matrix()
     at = np.array([0, 1.0, 4])
-    from humangs_jax.body.joints import PARENTS
-
     for j, p in enumerate(PARENTS):
         world[:, j] = world[:, j] if p < 0 else world[:, p] @ world[:, j]
     for joint, (name, _) in JOINTS.items():
