@@ -235,5 +235,5 @@ def figure(
         drawn.legend(*handles, loc="outside lower center", ncols=2, fontsize=7)
     drawn.tight_layout(rect=(0, legend, 1, 1))
     path.parent.mkdir(parents=True, exist_ok=True)
-    drawn.savefig(path, dpi=110)
+    drawn.savefig(path, dpi=150)
     plt.close(drawn)

@@ -1,11 +1,13 @@
 """Images of an evaluation: the best people beside the worst, and PSNR against the number of views."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.harness import Run, entry
 from experiments.subjects import TASKS, Drawn, task_views
 from humangs_jax.avatar.sheets import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
@@ -110,3 +112,79 @@ def write_triples(
     headers *= min(across, len(images))
     sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
     sheet.save(path, format="JPEG", quality=85)
+
+
+POSES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "wave": {"left_shoulder": (0, 0, -68), "right_shoulder": (0, 0, -35), "right_elbow": (0, 0, -55), "neck": (0, -15, 8)},
+    "step": {"left_shoulder": (0, 35, -55), "right_shoulder": (0, 35, 60), "left_hip": (-55, 0, 0), "left_knee": (75, 0, 0),
+             "left_elbow": (0, -50, 0), "spine1": (8, 0, 0)},
+    "stretch": {"left_shoulder": (0, 0, 62), "right_shoulder": (0, 0, -62), "left_hip": (0, 0, 14), "right_hip": (0, 0, -14)},
+}  # fmt: skip
+"""Poses that no photo shows: degrees of axis-angle by joint."""
+
+
+@entry
+def readme_pictures(run: Run, avatar: Path, out: Path = Path("docs/images"), size: int = 512) -> None:
+    """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in new poses, and its face.
+
+    Options:
+        avatar: avatar.npz of `humangs demo`
+        out: folder of the images
+        size: height of a picture, pixels
+    """
+    import jax.numpy as jnp
+    from PIL import Image
+
+    from humangs_jax.avatar.animate import animate
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.avatar.frames import a_pose_of, images, motion_views, turntable_views
+    from humangs_jax.avatar.shot import Shot
+    from humangs_jax.avatar.video import write_video
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.data.motion import load_motion
+    from humangs_jax.geometry.camera import look_at
+    from humangs_jax.rendering.splatting import render
+
+    person, photos = Avatar.load(avatar), load_capture("demo_capture")
+    shot = Shot(size=size, azimuth=0.0)
+
+    def drawn(pose: BodyPose, shot: Shot) -> np.ndarray:
+        return next(images(person, *turntable_views(person, pose, 1, shot), shot))
+
+    def posed(turns: Mapping[str, tuple[float, float, float]]) -> BodyPose:
+        rotations = np.zeros((len(person.parents), 3), np.float32)
+        for name, turn in turns.items():
+            rotations[person.joint_names.index(name)] = np.radians(turn)
+        return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
+
+    half = [np.asarray(Image.fromarray(to_uint8(x)).resize((size // 2, size // 2), 1)) / 255 for x in photos.images[:4]]
+    pictures = [np.concatenate([np.concatenate(half[:2], axis=1), np.concatenate(half[2:], axis=1)])]
+    rest = a_pose_of(person)
+    pictures += [drawn(rest, shot), drawn(rest, dataclasses.replace(shot, azimuth=130.0))]
+    pictures += [drawn(posed(turns), dataclasses.replace(shot, azimuth=30.0)) for turns in POSES.values()]
+    head = person.rest_joints[person.joint_names.index("head")]
+    K = jnp.asarray([[2.6 * size, 0, size / 2], [0, 2.6 * size, size / 2], [0, 0, 1]])
+    eye = jnp.asarray([0.35, 0.05, 1.5])
+    face = look_at(
+        head + jnp.asarray([0, 0.06, 0.0]) + eye,
+        head + jnp.asarray([0, 0.06, 0.0]),
+        jnp.asarray([0.0, 1, 0]),
+        K,
+        size,
+        size,
+    )
+    pictures.append(np.clip(np.asarray(render(animate(person, posed({})), face).rgb), 0, 1))
+    strip = np.concatenate([_framed(x, size) for x in pictures], axis=1)
+    Image.fromarray(to_uint8(strip)).save(out / "readme.jpg", quality=88)
+    motion = load_motion()
+    frames = images(person, *motion_views(person, motion, dataclasses.replace(shot, azimuth=25.0), 40.0), shot)
+    write_video(out / "animation.gif", frames, motion.fps)
+    run.show(f"{out / 'readme.jpg'}: {strip.shape[1]} x {strip.shape[0]}")
+
+
+def _framed(image: np.ndarray, size: int) -> np.ndarray:
+    """Cut to the columns that are not white, with a margin."""
+    used = np.flatnonzero((image < 0.98).any(axis=(0, 2)))
+    left, right = max(0, used[0] - size // 32), min(image.shape[1], used[-1] + size // 32)
+    return image[:, left:right]

@@ -227,34 +227,20 @@ def table(result: dict[str, Any]) -> str:
 
 
 def plot(path: Path, result: dict[str, Any]) -> None:
-    """Time relative to exact against PSNR, forward and forward+backward, with the front."""
-    exact = {**result["exact"], "label": "exact", "knob": "preset"} | {f"{name}_cpu": 1.0 for name in DIRECTIONS}
+    """Time relative to exact against PSNR: a line for each knob, the presets, and the front of all settings."""
+    exact = {**result["exact"], "label": "exact", "knob": "preset", "forward_cpu": 1.0}
     rows = [exact] + [r for r in result["settings"] if r["knob"] not in SCHEDULE and r["label"] != "inria"]
-    with figure(path, 2, (13, 6)) as axes:
-        for axis, name in zip(axes, DIRECTIONS, strict=True):
-            _draw_panel(axis, rows, f"{name}_cpu")
-            axis.set(xlabel=f"{name.replace('_', ' + ')}: CPU time relative to exact", xlim=(None, 1.1))
-        axes[0].set_ylabel("PSNR to the exact image, dB")
-        axes[1].legend(fontsize=8, loc="upper left")
-        title = f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets. Grey: the fronts"
-        axes[0].set_title(title + ", with and without leaving hidden Gaussians out", fontsize=8, loc="left")
-
-
-def _draw_panel(axis, rows, time):
-    whole = [row for row in rows if "hidden" not in row["label"]]
-    for some, color in ((rows, "0.85"), (whole, "0.65")):
-        steps = zip(*((r[time], r["psnr"]) for r in pareto(some, time)), strict=True)
-        axis.step(*steps, where="post", color=color, lw=2.5)
-    knobs = dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")
-    for i, knob in enumerate(knobs):
-        points = [(row[time], row["psnr"]) for row in rows if row["knob"] == knob]
-        style = "s" if knob == "combined" else "o-"
-        axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.8, color=f"C{i}", label=knob)
-    for row in rows:
-        point = row[time], row["psnr"]
-        if row["knob"] == "preset":
-            axis.plot(*point, "*", ms=14, color="black", zorder=3)
-            axis.annotate(row["label"], point, (8, 4), textcoords="offset points", weight="bold")
-        elif row["knob"] != "combined":  # what is combined: see the table
-            text = row["label"].removeprefix(row["knob"]).strip()
-            axis.annotate(text, point, (5, -8), textcoords="offset points", fontsize=6.5, color="0.35")
+    with figure(path, 1, (8, 4.4)) as axis:
+        steps = zip(*((r["forward_cpu"], r["psnr"]) for r in pareto(rows, "forward_cpu")), strict=True)
+        axis.step(*steps, where="post", color="0.8", lw=3, label="best of all settings")
+        for i, knob in enumerate(dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")):
+            points = [(row["forward_cpu"], row["psnr"]) for row in rows if row["knob"] == knob]
+            style = "s" if knob == "combined" else "o-"
+            axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.9, color=f"C{i}", label=knob)
+        for row in (row for row in rows if row["knob"] == "preset"):
+            point = row["forward_cpu"], row["psnr"]
+            axis.plot(*point, "*", ms=13, color="black", zorder=3)
+            axis.annotate(row["label"], point, (-8, 6), textcoords="offset points", weight="bold", ha="right")
+        axis.set(xlabel="CPU time of an image relative to exact", ylabel="PSNR to the exact image, dB")
+        axis.set_title(f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels", fontsize=9)
+        axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

@@ -224,7 +224,7 @@ EQUAL = 1.05
 TASKS = {"novel": "same pose", "animation": "novel poses"}
 SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3), "psnr_fg": ("foreground PSNR", 2)}
 NAIVE = ("vertex-color baseline", "random colors")
-KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "naive": "#7f8c8d"}
+KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "no network": "#7f8c8d"}
 Row = dict[str, Any]
 
 
@@ -277,7 +277,7 @@ def quality(row: Row) -> float:
 def kind(row: Row) -> str:
     """Of `KINDS`."""
     if row["start"] in NAIVE:
-        return "naive"
+        return "no network"
     return "refined" if row["settings"]["refine_steps"] or row["settings"]["refine_iterations"] else "feed-forward"
 
 
@@ -389,7 +389,7 @@ def naive_table(rows: list[Row]) -> str:
     ours = [row for row in compared(rows) if row["start"] == "network"]
     table = []
     for row in compared(rows):
-        if kind(row) != "naive":
+        if kind(row) != "no network":
             continue
         above = better(row, ours)
         found = min(above, key=lambda r: r["reconstruct"] + r["frame"]) if above else None
@@ -453,20 +453,27 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
 
 def draw(rows: list[Row], key: str, path: Path) -> None:
     """PSNR of both tasks against a time, with the front."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     points = compared(rows)
     with figure(path, 2, (10, 4.4)) as axes:
         for axis, (task, title) in zip(axes, TASKS.items(), strict=True):
             for name, color in KINDS.items():
                 chosen = [row for row in points if kind(row) == name]
                 x, y = [row[key] for row in chosen], [row[task]["psnr"] for row in chosen]
-                axis.scatter(x, y, s=18, color=color, marker="x" if name == "naive" else "o", label=name)
+                axis.scatter(x, y, s=18, color=color, marker="x" if name == "no network" else "o", label=name)
             steps = staircase([(row[key], row[task]["psnr"]) for row in points if row["start"] == "network"])
             axis.step(*zip(*steps, strict=True), where="post", color="k", lw=0.8, label="front")
-            for row in (row for row in points if row["knob"] == "preset" or row["name"] == "default"):
-                at = row[key], row[task]["psnr"]
-                axis.annotate(row["name"], at, fontsize=7, xytext=(3, 3), textcoords="offset points")
+            named = [row for row in points if row["knob"] == "preset" or row["name"] == "default"]
+            for i, row in enumerate(sorted(named, key=lambda row: row[key])):
+                at, line = (row[key], row[task]["psnr"]), {"arrowstyle": "-", "lw": 0.6, "color": "0.4"}
+                place = (14, -26 - 18 * (i % 2))  # below the front, where there is room
+                axis.annotate(row["name"], at, place, fontsize=8, textcoords="offset points", arrowprops=line)
             label = f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default"
             axis.set(xscale="log", title=title, ylabel="PSNR, dB", xlabel=label)
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
         axes[0].legend(fontsize=7)
 
 

@@ -129,7 +129,7 @@ def ablate(
 
     Example:
         result = hg.ablate("tiny", {"no class token": {"model.architecture.encoder.transformer.class_token": False}})
-        print(result)
+        result.plot()
     """
     if BASE in variants:
         raise ArgumentError("variants", f"{BASE!r}: is the name of the run that variants are compared with")
