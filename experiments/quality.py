@@ -4,13 +4,10 @@ import dataclasses
 import functools
 import itertools
 import os
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
@@ -29,27 +26,16 @@ from experiments.subjects import (
     score_tasks,
     shipped_digest,
 )
-from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.body.library import load_body
-from humangs_jax.data.loading import ViewSampling, find_captures
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
-from humangs_jax.data.views import gaussian_body, select_views
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.evaluation.scores import score
-from humangs_jax.losses import metrics
-from humangs_jax.network.weights import load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
-from humangs_jax.people.subject import make_subject, seeds_of
+from humangs_jax.people.subject import make_subject
 from humangs_jax.people.writer import View, capture_views, sample_pose
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine
-from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.forward import predict
-from humangs_jax.training.sources import captured_people
-from humangs_jax.training.validation import validation_examples
 
 PHOTOS = 4
 ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None)
@@ -340,147 +326,3 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     """The mask dilated, or eroded below 0."""
     side = 2 * abs(pixels) + 1
     return mask if pixels == 0 else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))
-
-
-# Choice of photos ----------------------------------------------------------------------------------------------------
-
-CHOICES, CHOICE_HELD_OUT, DRAWS = 20, 8, 4
-
-
-@entry
-def evaluation_view_selection(run: Run, subjects: int = 8, count: int = 4) -> None:
-    """What choosing photos by coverage gains over random ones: of 20 photos at random azimuths, 4 are used.
-
-    Options:
-    subjects: people of the validation seeds
-    count: photos that are used
-    """
-    cases = {str(seed): functools.partial(_choices_of, seed, count) for seed in seeds_of("validation", 0, subjects)}
-    rows = list(run.rows(cases, {"count": count}).values())
-    titles = {"random": f"{count} at random", "chosen": f"{count} chosen", "all": f"all {CHOICES}"}
-    mean = means([{key: row[key] for key in titles} for row in rows])
-    table = [[title, *(f"{mean[key][name]:.2f}" for name in ("psnr", "psnr_fg"))] for key, title in titles.items()]
-    better = sum(row["chosen"]["psnr"] > row["random"]["psnr"] for row in rows)
-    about = (
-        f"Means over {len(rows)} people of the validation seeds, {CHOICES} photos of 256 pixels at random azimuths; "
-        f"{DRAWS} random choices each. The chosen ones are better for {better} of {len(rows)}; choosing takes "
-        f"{np.median([row['seconds'] for row in rows]):.2f} s."
-    )
-    run.show(
-        f"{about}\n\n{markdown_table(['photos', 'PSNR, dB', 'foreground PSNR, dB'], table, 'lrr')}", {"means": mean}
-    )
-
-
-def _choices_of(seed, count):
-    rng, body, (variables, config) = np.random.default_rng([seed, CHOICES]), load_body(), load_weights()
-    subject = make_subject(seed, body)
-    pose, total = sample_pose(subject, 0), CHOICES + CHOICE_HELD_OUT
-    cameras = cameras_around(rng, pose.vertices, rng.uniform(0, 2 * np.pi, total), 256)
-    capture = capture_views(subject, body, [pose], [View(0, f"{i:02d}", cameras[i]) for i in range(total)])
-    photos, held_out = capture.select(range(CHOICES)), capture.select(range(CHOICES, total))
-
-    def score_of(chosen):
-        drawn = capture_renderings(reconstruct(variables, config, photos.select(chosen)), held_out)[1]
-        found = score(np.stack([np.asarray(rendering.rgb) for rendering in drawn]), held_out)
-        return {"psnr": float(found.psnr), "psnr_fg": float(found.psnr_fg)}
-
-    select_views(photos, count)  # compiles
-    began = time.perf_counter()
-    chosen = select_views(photos, count)
-    seconds = time.perf_counter() - began
-    random = means([score_of(rng.choice(CHOICES, count, replace=False)) for _ in range(DRAWS)])
-    whole = score_of(range(CHOICES))
-    return {"seconds": seconds, "photos": chosen, "chosen": score_of(chosen), "random": random, "all": whole}
-
-
-# Where the error is --------------------------------------------------------------------------------------------------
-
-BAND = 3
-"""Pixels to either side that count as the silhouette."""
-LEAST_COVERAGE = 0.05
-"""Below this coverage the predicted color is undefined; the true one is used."""
-
-
-@entry
-def evaluation_error_shares(
-    run: Run,
-    people: Path,
-    weights: tuple[str, ...] = ("shipped=",),
-    sizes: tuple[int, ...] = (256,),
-    views: int = 4,
-    targets: int = 6,
-) -> None:
-    """Where the error of reconstructions is: at the silhouette, in holes, in the colors of the person, or around the person.
-
-    Means over all views of all people: PSNR; PSNR of the predicted colors under the true coverage; shares of the squared error;
-    semi-transparent foreground, also of the true images. About 20 s and 2 s a person on 2 CPU cores.
-
-    Options:
-    people: folder of captures with masks, as `humangs synth --poses 2 --views 12 --close-views 0` writes them
-    weights: NAME=FILE of weights to compare; NAME= stands for the shipped ones
-    sizes: sides of photos and targets, pixels
-    views: photos that the network sees
-    targets: other views of each person
-    """
-    if views < 1 or targets < 1:
-        raise ValueError("--views and --targets must be at least 1")
-    if unnamed := [pair for pair in weights if "=" not in pair]:
-        raise ValueError(f"--weights: expected NAME=FILE, got {unnamed[0]}")
-    columns = {}
-    for size in sizes:
-        for name, file in (pair.split("=", 1) for pair in weights):
-            sampling = ViewSampling(input_counts=(views,), target_count=targets)
-            columns[f"{name}, {size} px"] = _error_shares(people, Path(file) if file else None, size, sampling)
-    run.show(error_shares_section(columns), columns)
-
-
-def error_shares_section(columns: dict[str, dict[str, float]]) -> str:
-    """The table: a column for each size and weights."""
-    names = [name for name in next(iter(columns.values())) if name != "squared error"]
-    digits = lambda name: 2 if name.startswith("PSNR") else 3
-    rows = [[name, *(f"{column[name]:.{digits(name)}f}" for column in columns.values())] for name in names]
-    return markdown_table(["", *columns], rows)
-
-
-def _error_shares(people, weights, size, sampling):
-    """Means over people and views; shares are of the squared error of all."""
-    variables, model = load_weights(weights)
-    config = TrainConfig(model=model.with_conventions(image_size=size), views=sampling)
-    body, folders = load_body(), find_captures(people)
-    examples = validation_examples(captured_people(folders, body), config, len(folders))
-    body, draw, rows = gaussian_body(body, config.model), jax.jit(predict, static_argnames="config"), []
-    for example in examples:
-        drawn, _ = draw(variables, body, example, config)
-        targets = example.targets
-        pictures = zip(*(np.asarray(x) for x in (drawn.rgb, drawn.alpha, targets.images, targets.masks)), strict=True)
-        same = jnp.max(jnp.abs(targets.rotations - example.inputs.rotations[:1]), axis=(1, 2)) < 1e-3
-        for pose, picture in zip(np.asarray(same), pictures, strict=True):
-            found = error_shares(*picture)
-            psnr = found.pop("PSNR")
-            rows.append({f"PSNR, {'pose of the photos' if pose else 'other poses'}, dB": psnr, **found})
-    order = lambda name: (not name.startswith("PSNR"), name.startswith("semi_transparent"), name)
-    names = sorted({name for row in rows for name in row}, key=order)
-    mean = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
-    return {name: value / (mean["squared error"] if name.startswith("share") else 1) for name, value in mean.items()}
-
-
-def error_shares(rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """Squared error of one image (h, w, 3) by place, its PSNR, also under the true coverage, semi-transparent foreground."""
-    psnr = lambda drawn: float(metrics.psnr(jnp.asarray(drawn), jnp.asarray(image)))
-    error = ((np.clip(rgb, 0, 1) - image) ** 2).mean(-1)
-    inner = ndimage.binary_erosion(mask > 0.5, iterations=BAND)
-    outer = ~ndimage.binary_dilation(mask > 0.5, iterations=BAND)
-    color = np.clip((rgb - (1 - alpha[..., None])) / np.maximum(alpha, LEAST_COVERAGE)[..., None], 0, 1)
-    color = np.where(alpha[..., None] > LEAST_COVERAGE, color, image)
-    covered = color * mask[..., None] + 1 - mask[..., None]
-    return {
-        "PSNR": psnr(rgb),
-        "PSNR with the true silhouette and the predicted colors, dB": psnr(covered),
-        "squared error": float(error.mean()),
-        "share at the silhouette": float((error * ~(inner | outer)).mean()),
-        "share in holes": float((error * (1 - alpha) * inner).mean()),
-        "share in colors": float((error * alpha * inner).mean()),
-        "share around the person": float((error * outer).mean()),
-        "semi_transparent": float(metrics.semi_transparent(jnp.asarray(alpha), jnp.asarray(mask))),
-        "semi_transparent of the true images": float(metrics.semi_transparent(jnp.asarray(mask), jnp.asarray(mask))),
-    }

@@ -1,11 +1,11 @@
-"""What refinement gains, weights side by side, and README's tables, which are made of both."""
+"""What refinement gains, and README's tables, which are made of it."""
 
 import dataclasses
 import functools
 import itertools
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,18 +38,15 @@ def refinement(
     people: People = People(8),
     seconds: tuple[float, ...] = (1, 2, 5, 15),
     sizes: tuple[int, ...] = (256, 512),
-    scored_at: int | None = None,
     views: tuple[int, ...] = (4,),
-    starts: tuple[Literal["network", "random colors"], ...] = ("network",),
     iterations: tuple[int, ...] = (0, ITERATIONS),
     off: tuple[float, ...] = (0.0,),
     refine_poses: bool = False,
-    longest_edge: float | None = None,
     plot: Path | None = None,
     sheet: Path | None = None,
     details_sheet: Path | None = None,
 ) -> None:
-    """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colors.
+    """What refinement gains on held-out views, against its seconds.
 
     0 seconds are the start; seconds do not count compilation. One device: one core of a CPU. With --off, held-out views show the
     pose of the photos and are drawn with the same wrong body.
@@ -57,38 +54,29 @@ def refinement(
     Options:
     seconds: lengths of the runs
     sizes: sides of the photos in pixels (--size is not used)
-    scored_at: side of the held-out views in pixels; default: as the photos
     views: numbers of photos
-    starts: what is refined; "random colors": as many round Gaussians on the body's surface
     iterations: of the learned update; 0: Adam alone
     off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2 degrees, shapes change by 0.02
     refine_poses: the pose of each photo is refined, too
-    longest_edge: split the body's edges to this, metres
     plot: PSNR against seconds
     sheet: truth, feed-forward and the longest run of every person, largest size
     details_sheet: the same of faces, hands, hems and shoes
     """
     start = people.start()
-    start = start._replace(config=start.config.with_runtime(longest_edge=longest_edge))
-    settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "starts": starts, "off": off}
-    settings |= {"iterations": iterations, "refine_poses": refine_poses, "longest_edge": longest_edge}
-    settings |= {"scored_at": scored_at} if scored_at else {}
+    settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "off": off}
+    settings |= {"iterations": iterations, "refine_poses": refine_poses}
     settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
 
     def measure(seed):
         row, pictures = {}, None
         for size in sizes:
             subject = make_evaluation_subject(seed, start.body, views, size, start.held_out)
-            if scored_at:
-                scored = make_evaluation_subject(seed, start.body, views, scored_at, start.held_out)
-                subject = dataclasses.replace(subject, held_out=scored.held_out)
-            for count, wrong, begin, rounds in itertools.product(views, off, starts, iterations):
+            for count, wrong, rounds in itertools.product(views, off, iterations):
                 how = RefineConfig(iterations=rounds, poses=refine_poses)
-                cell, drawn = _refined(start, with_body_off(subject, wrong), count, begin, how, seconds)
+                cell, drawn = _refined(start, with_body_off(subject, wrong), count, how, seconds)
                 also = f", {rounds} iterations" if rounds else ""
-                row[f"{size} {count} {begin}{also}" + (f", body {wrong:g} mm off" if wrong else "")] = cell
-                if begin == "network" and count == max(views):
-                    pictures = drawn
+                row[f"{size} {count} network{also}" + (f", body {wrong:g} mm off" if wrong else "")] = cell
+                pictures = drawn if count == max(views) else pictures
         return row, pictures
 
     cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
@@ -121,12 +109,10 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
     return dataclasses.replace(subject, photos=moved(subject.photos), held_out=moved(still))
 
 
-def _refined(start, subject, count, begin, how, seconds):
+def _refined(start, subject, count, how, seconds):
     """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the front, whole and in details."""
     inputs = subject.inputs(count)
     avatar = reconstruct(start.variables, start.config, inputs)
-    if begin == "random colors":
-        avatar = random_start(avatar, subject.seed)
     view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
     scores, first = score_all(avatar, subject.held_out, view)
     cell, last = {"0": scores}, first
@@ -137,22 +123,6 @@ def _refined(start, subject, count, begin, how, seconds):
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
     drawn = (subject.held_out.images[view], first, last)
     return cell, (drawn, [np.concatenate(list(details(image, subject.held_out, view)), axis=1) for image in drawn])
-
-
-def random_start(avatar: Any, seed: int) -> Any:
-    """Round Gaussians of random colors where the body's surface is, as many as the avatar has."""
-    rng, count = np.random.default_rng(seed), len(avatar.gaussians.means)
-    means = jnp.repeat(avatar.rest_vertices, count // len(avatar.rest_vertices), axis=0)
-    gaussians = replace(
-        avatar.gaussians,
-        means=means + jnp.asarray(0.005 * rng.normal(size=means.shape), jnp.float32),
-        quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)),
-        scales=jnp.full((count, 3), 0.01),
-        opacities=jnp.full(count, 0.5),
-        colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
-        low_pass=None,
-    )
-    return replace(avatar, gaussians=gaussians, light=None)
 
 
 def score_all(avatar: Any, held_out: Any, view: int = 0) -> tuple[dict[str, Any], np.ndarray]:
@@ -197,10 +167,8 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
         f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; "
         "worst-subject gain: the least of any person."
     )
-    scored_at = settings.get("scored_at")
-    about += f" Views of {scored_at} px." if scored_at else ""
     true = {
-        scored_at or name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
+        name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
         for name, lengths in numbers.items()
         if "semi_transparent_of_truth" in lengths["0"]["novel"]
     }
@@ -223,71 +191,6 @@ def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
                     )
             axis.set(xlabel="seconds", ylabel="PSNR, dB", title=title)
             axis.set_xscale("symlog", linthresh=1)
-
-
-# Side by side --------------------------------------------------------------------------------------------------------
-
-MAY_DIFFER = ("weights", "tokens", "crop", "skinning_reach")
-COMPARED = {"psnr": 2, "psnr_fg": 2, "ssim": 4, "semi_transparent": 3}
-"""Scores, and their digits."""
-
-
-@entry
-def compare(run: Run, results: tuple[str, ...]) -> None:
-    """Weights, or two ways to use them, side by side, from the OUTs of `refinement` for each (--table names the table).
-
-    They may differ in --weights, --tokens, --crop and --skinning-reach.
-
-    Options:
-    results: NAME=OUT
-    """
-    named = dict(pair.split("=", 1) for pair in results)
-    found = {name: json.loads(Path(path).read_text()) for name, path in named.items()}
-    numbers = compared(found)
-    heads = {"psnr": "PSNR", "psnr_fg": "foreground PSNR", "ssim": "SSIM"}
-    tasks = {"novel": "same pose", "animation": "novel poses"}
-    header = [
-        "weights",
-        "refined, s",
-        *(f"{title}: {heads.get(key, key)}" for title in tasks.values() for key in COMPARED),
-    ]
-    rows = [
-        [name, seconds, *(f"{scores[task][key]:.{digits}f}" for task in tasks for key, digits in COMPARED.items())]
-        for name, lengths in numbers.items()
-        for seconds, scores in lengths.items()
-    ]
-    score = lambda row, seconds: next(iter(row.values()))[seconds]["novel"]["psnr_fg"]
-    each = {
-        name: {seconds: [score(row, seconds) for row in found[name]["rows"].values()] for seconds in lengths}
-        for name, lengths in numbers.items()
-    }
-    run.show(markdown_table(header, rows), {"means": numbers, "people": each})
-
-
-def compared(results: dict[str, Any]) -> dict[str, Any]:
-    """{name: {seconds: {task: {score: mean}}}}.
-
-    Raises: ValueError if two results are not of the same people and settings, or one is of several starts.
-    """
-    common = [
-        ({key: value for key, value in result["settings"].items() if key not in MAY_DIFFER}, list(result["rows"]))
-        for result in results.values()
-    ]
-    numbers = {}
-    for (name, result), found in zip(results.items(), common, strict=True):
-        if found != common[0]:
-            raise ValueError(
-                f"{name}: expected the people and settings of {next(iter(results))}: {common[0]}, got {found}"
-            )
-        mean = refinement_means(list(result["rows"].values()))
-        if len(mean) != 1:
-            raise ValueError(f"{name}: expected one size, number of photos and start, got {list(mean)}")
-        numbers[name] = {
-            seconds: {task: {key: scores[task][key] for key in COMPARED} for task in TASKS}
-            for lengths in mean.values()
-            for seconds, scores in lengths.items()
-        }
-    return numbers
 
 
 # README --------------------------------------------------------------------------------------------------------------

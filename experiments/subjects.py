@@ -21,7 +21,7 @@ import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyModel, BodyPose, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 from humangs_jax.evaluation.scores import PROTOCOLS, score_views
@@ -35,7 +35,7 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
-from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, SyntheticSubject, make_subject, seeds_of
+from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12
@@ -56,9 +56,6 @@ class People:
     split: seeds of the people; choices are made on "validation"
     weights: weights file; the shipped ones if not given
     tokens: patches that the network looks at; as it was trained if not given
-    crop: photos are cut to the person first
-    loosest_of: of so many people, those in the loosest clothes
-    skinning_reach: metres; other reach of the skinning between the legs than the weights'; 0: by its own vertex alone
     lpips_backbone: weights of the network under LPIPS; those of the extra `lpips` if not given
     lpips_heads: heads of LPIPS, where the backbone's file does not have them
     lpips_net: which network that is
@@ -73,9 +70,6 @@ class People:
     split: Literal["test", "validation"] = "test"
     weights: Path | None = None
     tokens: Literal["all", "foreground"] | None = None
-    crop: bool = False
-    loosest_of: int | None = None
-    skinning_reach: float | None = None
     lpips_backbone: Path | None = None
     lpips_heads: Path | None = None
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
@@ -86,22 +80,12 @@ class People:
             raise ValueError(
                 "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0"
             )
-        if self.loosest_of is not None and self.loosest_of < self.subjects:
-            raise ValueError(f"--loosest-of must be at least --subjects, {self.subjects}")
-        if self.skinning_reach is not None and self.skinning_reach < 0:
-            raise ValueError("--skinning-reach must be at least 0")
         backbone = self.lpips_backbone or installed_lpips().get(self.lpips_net)
         lpips = load_loss_networks(None, backbone, self.lpips_heads, self.lpips_net).lpips
         body, (variables, config) = load_body(), load_weights(self.weights)
-        if (reach := self.skinning_reach) is not None:
-            config = config.with_conventions(skinning_reach=reach or None)
-        config = config.with_runtime(tokens=self.tokens, crop=self.crop)
-        seeds = list(seeds_of(self.split, self.first, self.loosest_of or self.subjects))
-        if self.loosest_of is not None:
-            loose = [looseness(make_subject(seed, body), body) for seed in seeds]
-            seeds = [seeds[i] for i in sorted(np.argsort(loose)[-self.subjects :])]
-        given = {name: getattr(self, name) for name in ("loosest_of", "skinning_reach")} | {"crop": self.crop or None}
-        settings = {name: value for name, value in given.items() if value is not None} | {
+        config = config.with_runtime(tokens=self.tokens)
+        seeds = list(seeds_of(self.split, self.first, self.subjects))
+        settings = {
             "weights": file_digest(self.weights) if self.weights else shipped_digest(SHIPPED),
             "tokens": config.tokens,
             "split": self.split,
@@ -195,20 +179,6 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
             carried[:, joint] = rotations[:, names.index(name)]
     poses = jax.vmap(BodyPose)(jnp.asarray(carried), capture.poses.translation)
     return dataclasses.replace(capture, body=body, poses=poses)
-
-
-def looseness(subject: SyntheticSubject, body: BodyModel) -> float:
-    """How far clothes, hair and bags are from the body at rest: the distance in metres that a tenth of the surface exceeds."""
-    from scipy.spatial import KDTree
-
-    triangles = subject.surface.vertices[subject.surface.faces]
-    edges = triangles[:, 1:] - triangles[:, :1]
-    areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
-    skin = shape_body(body, jnp.asarray(subject.betas)).vertices
-    distances, _ = KDTree(np.asarray(skin)).query(triangles.mean(1))
-    order = np.argsort(distances)
-    share = np.cumsum(areas[order]) / areas.sum()
-    return float(distances[order][np.searchsorted(share, 0.9)])
 
 
 def ring_positions(count: int) -> tuple[int, ...]:

@@ -22,7 +22,6 @@ import numpy as np
 from experiments import tradeoff_report
 from experiments.harness import Run, entry
 from experiments.reconstruction import random_variables
-from experiments.refinement import random_start
 from experiments.results import REPOSITORY, markdown_table, write_json
 from experiments.subjects import (
     TASKS,
@@ -169,6 +168,22 @@ def person_of(seed: int, body, folder: Path | None):
     photos, held_out = (load_capture(place / name, body=body) for name in ("photos", "held_out"))
     positions = tuple(sorted({position for count in PHOTOS for position in ring_positions(count)}))
     return EvaluationSubject(seed, photos, positions, held_out)
+
+
+def random_start(avatar: Any, seed: int) -> Any:
+    """Round Gaussians of random colors where the body's surface is, as many as the avatar has."""
+    rng, count = np.random.default_rng(seed), len(avatar.gaussians.means)
+    means = jnp.repeat(avatar.rest_vertices, count // len(avatar.rest_vertices), axis=0)
+    gaussians = replace(
+        avatar.gaussians,
+        means=means + jnp.asarray(0.005 * rng.normal(size=means.shape), jnp.float32),
+        quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)),
+        scales=jnp.full((count, 3), 0.01),
+        opacities=jnp.full(count, 0.5),
+        colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
+        low_pass=None,
+    )
+    return replace(avatar, gaussians=gaussians, light=None)
 
 
 class Bench:

@@ -9,7 +9,6 @@ from experiments.harness import call, listed
 
 PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
 CASES = {
-    "evaluation_view_selection": "--subjects 1",
     "extremes": "--cases black",
     "fit_end_to_end": "--people 1 --seconds 0.5",
     "fit_keypoints": "--people 1 --frames 1 --no-curves",

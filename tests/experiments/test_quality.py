@@ -1,4 +1,4 @@
-"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and verdicts; error by place.
+"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and verdicts.
 
 The network is `tiny` with variables of zero; for bodies of other sizes its avatars are made up.
 """
@@ -182,47 +182,3 @@ def test_the_section_has_means_and_the_best_and_worst():
     section = quality.views_section(people(v1=[21, 22], v4=[25, 26]), 4, "about")
     assert "| novel poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
     assert "LPIPS" not in section and "| worst 1 | 1 | 25.00 |" in section
-
-
-# Where the error is --------------------------------------------------------------------------------------------------
-
-
-def square(size=48, half=12):
-    """A grey square on white: colors, coverage."""
-    alpha = np.zeros((size, size))
-    alpha[size // 2 - half : size // 2 + half, size // 2 - half : size // 2 + half] = 1
-    return np.where(alpha[..., None] > 0, 0.4, 1.0) * np.ones(3), alpha
-
-
-PLACES = ("share at the silhouette", "share in holes", "share in colors", "share around the person")
-
-
-@pytest.mark.parametrize("place", PLACES)
-def test_an_error_is_counted_where_it_is(place):
-    image, mask = square()
-    rgb, alpha = image.copy(), mask.copy()
-    if place == "share at the silhouette":
-        rgb, alpha = square(half=11)
-    elif place == "share in holes":
-        rgb[24, 24], alpha[24, 24] = 1, 0
-    elif place == "share in colors":
-        rgb[24, 24] = 0.9
-    else:
-        rgb[2, 2], alpha[2, 2] = 0.4, 1
-    found = quality.error_shares(rgb, alpha, image, mask)
-    assert found["squared error"] > 0 and np.isclose(found[place], found["squared error"])
-    assert all(found[name] == 0 for name in PLACES if name != place)
-    table = quality.error_shares_section({"before": found, "now": found | {place: 0.125}})
-    assert f"| {place} |" in table and "0.125" in table and "squared error" not in table
-
-
-def test_true_coverage_and_semi_transparent_foreground():
-    image, mask = square()
-    rgb, alpha = square(half=11)
-    rgb[24, 24] = 0.5  # so that the PSNR is finite
-    found = quality.error_shares(rgb, alpha, image, mask)
-    assert found["PSNR with the true silhouette and the predicted colors, dB"] > found["PSNR"] + 20
-    alpha = mask.copy()
-    alpha[24:26, 24] = 0.5
-    found = quality.error_shares(image, alpha, image, mask)
-    assert np.isclose(found["semi_transparent"], 2 / mask.sum()) and found["semi_transparent of the true images"] == 0

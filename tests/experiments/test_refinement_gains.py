@@ -1,4 +1,4 @@
-"""Means and tables of refinement, weights side by side, README's tables: without rendering anybody."""
+"""Means and tables of refinement, README's tables: without rendering anybody."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.pictures import DETAIL_PIXELS, DETAILS, details, frontal_view
-from experiments.refinement import compared, readme_quality, readme_times, refinement_means, refinement_section
+from experiments.refinement import readme_quality, readme_times, refinement_means, refinement_section
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.data.capture import Capture
@@ -27,22 +27,6 @@ def test_means_gains_and_the_table():
     table = refinement_section(means, {"split": "test"}, 2)
     assert "| 4 of 256 px | network | 5 | novel views | 23.25 | 18.75 | 15.00 | 0.100 | 0.50 |" in table
     assert "| 4 of 256 px | network | 0 | novel views | 22.00 | 18.75 | 15.00 | 0.100 |  |" in table
-
-
-def test_weights_side_by_side_are_of_the_same_people_and_of_one_start():
-    result = lambda gain=0.0, seed="3", **settings: {
-        "settings": {"weights": f"sha {gain}", "split": "test"} | settings,
-        "rows": {seed: row(20.0 + gain, 22.0 + gain)},
-    }
-    means = compared({"a": result(), "b": result(1.5)})
-    assert means["a"]["0"]["novel"]["psnr"] == 20 and means["b"]["5"]["animation"]["psnr"] == 23.5
-    for other in (result(seed="4"), result(split="validation")):
-        with pytest.raises(ValueError, match="b: expected the people and settings of a"):
-            compared({"a": result(), "b": other})
-    several = result()
-    several["rows"]["3"] |= row(20.0, 22.0, name="512 4 network")
-    with pytest.raises(ValueError, match="a: expected one size"):
-        compared({"a": several})
 
 
 TIMES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
