@@ -22,7 +22,7 @@ from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry
 from experiments.reconstruction import benchmark, configured
 from experiments.results import markdown_table
-from experiments.scenes import load_scene
+from experiments.splatting import demo_scene
 from experiments.timing import medians
 from experiments.train_shipped import main as train_shipped
 from experiments.training import Case, abstract_batch, random_networks, settings, with_model
@@ -41,7 +41,6 @@ from humangs_jax.people.bank import build_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.people.subject import SPLITS
 from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import plan_buffers, render
 from humangs_jax.training import sharding
 from humangs_jax.training.config import small, tiny
@@ -144,7 +143,7 @@ def check(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
         return errors(everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs))
 
     def splat():
-        scene = demo_scene(1_000 if day.tiny else COUNTS[0], 64 if day.tiny else 256)
+        scene = demo_scene(64 if day.tiny else 256, 1_000 if day.tiny else COUNTS[0])
         gaussians, camera = scene
         config = plan_buffers(gaussians, camera)
         target = jnp.asarray(np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32))
@@ -175,26 +174,12 @@ def resumed() -> dict[str, Any]:
     return {"largest difference": difference, "bitwise": difference == 0}
 
 
-def demo_scene(count: int, size: int) -> tuple[Any, Any]:
-    """(Gaussians, camera): the demo person with `count` Gaussians, drawn from her own and moved within their extent, smaller
-    in proportion to their spacing.
-    """
-    scene = load_scene("demo", size)
-    rng = np.random.default_rng(count)
-    own = len(scene.means)
-    rows = np.arange(count) % own
-    share = np.sqrt(min(1.0, own / count))
-    moved = scene.means[rows] + (1 - share) * scene.scales[rows] * rng.standard_normal((count, 3))
-    arrays = moved, scene.quats[rows], share * scene.scales[rows], scene.opacities[rows], scene.colors[rows]
-    return Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays)), scene.camera()
-
-
 def splatting(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
     """Milliseconds of an image, alone and with gradients."""
     counts, sizes = ((1_000,), (64,)) if day.tiny else (COUNTS, (256, 512, 1024))
 
     def measure(count, size):
-        gaussians, camera = demo_scene(count, size)
+        gaussians, camera = demo_scene(size, count)
         config = plan_buffers(gaussians, camera)
         draw = jax.jit(lambda g: render(g, camera, config).rgb)
         gradient = jax.jit(jax.grad(lambda g: jnp.mean(render(g, camera, config).rgb ** 2)))

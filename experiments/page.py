@@ -11,9 +11,9 @@ import numpy as np
 from experiments.chromium import Chromium, missing
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
+from experiments.subjects import shipped_person
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
@@ -21,7 +21,6 @@ from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.losses import metrics
-from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import render
 from humangs_jax.viewer.page import write_page
@@ -85,13 +84,6 @@ def _measured(avatar, file, size, frames):
         asked = {"frames": frames, "width": size, "height": size}
         timed = browser.run("return humangs.benchmark(given[0])", asked)
         return row | {"fps": timed["fps"], "sort_ms": timed["sort_ms"], "console": browser.problems()}
-
-
-def shipped_person(longest_edge: float | None = None) -> Avatar:
-    """The person of the demo from four photos, feed-forward."""
-    variables, config = load_weights()
-    config = config.with_runtime(longest_edge=longest_edge)
-    return reconstruct(variables, config, load_capture(DEMO_CAPTURE))
 
 
 def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyPose]]:

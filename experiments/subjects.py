@@ -19,10 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 from humangs_jax.evaluation.scores import PROTOCOLS, score_views
 from humangs_jax.evaluation.tables import mean_scores
@@ -122,6 +124,12 @@ class Start(NamedTuple):
             f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in novel poses; "
             f"weights {s['weights'][:12]}, tokens: {s['tokens']}."
         )
+
+
+def shipped_person(longest_edge: float | None = None) -> Avatar:
+    """The person of the demo from four photos, feed-forward."""
+    variables, config = load_weights()
+    return reconstruct(variables, config.with_runtime(longest_edge=longest_edge), load_capture(DEMO_CAPTURE))
 
 
 def shipped_digest(asset: str) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from experiments.harness import Run, entry
-from experiments.page import shipped_person
 from experiments.results import markdown_table
+from experiments.subjects import shipped_person
 from experiments.timing import medians
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import (

@@ -1,34 +1,34 @@
-"""Run a checkpoint of the published network on stored inputs and compare every stage with the stored numbers.
-
-    python experiments/paper/check_parity.py CKPT.pt ARRAYS.npz CONFIG.json [--dtype float32|float64|bfloat16] [--json OUT]
-
-CKPT is in the released format (or its state dict as .safetensors), CONFIG the release's configuration: sizes must agree
-with the checkpoint's, and it says what shapes do not tell (pooling, width of a head). ARRAYS holds b subjects of v views:
-
-    in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4), in_smpl_canonical_vertices and
-    in_smpl_posed_vertices (b,v,n,3), in_joint_transforms (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map
-    (b,v,h,w,3) and in_depth_map (b,v,1,h,w) in normalised units
-    out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w), mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d),
-    mid_feature_map_stride4 (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
-    (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights (every fifth of n*k),
-    posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is free)
-
-Prints, per stage, the largest error over all subjects relative to the stage's largest magnitude. Exit status 1 if one
-exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or if an array of a stage (any that is not in_*) could not be
-compared; 2 if an input is unusable. --json writes {"dtype", "bound", "stages": {array: relative error, or null if it was
-not compared}, "passed"}. Seconds for small networks. Expected on golden_a and golden_b: see docs/parity.md.
+"""A checkpoint of the published network on stored inputs: every stage against the stored numbers.
 
 A blended transform is no rotation, and the quaternion that the release makes of it jumps where two of its four candidates
 tie. Where ours tie to within the bound, the nearer one counts: rounding decides there, in the release as here.
 """
 
-import argparse
 import json
-import sys
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.harness import Run, entry
+from experiments.results import markdown_table
+from humangs_jax.core.pytree import replace
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.network.config import HumanGSConfig, paper_parts
+from humangs_jax.network.conversion import load_checkpoint
+from humangs_jax.network.encoder import encoder_pixels, sample_triplane
+from humangs_jax.network.humangs import intermediates, part_variables
+from humangs_jax.network.maps import Convolution
+from humangs_jax.network.parts import HumanGSInputs
+from humangs_jax.network.vertex_decoder import corrected_skinning_weights
+from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+from humangs_jax.rendering.splatting import render
 
 BOUNDS = {"float32": 2e-5, "float64": 1e-6, "bfloat16": 5e-2}
 STAGES = {
@@ -68,10 +68,6 @@ MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 
 def load_arrays(path: Path) -> dict[str, Any]:
     """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each other."""
-    import zipfile
-
-    import numpy as np
-
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -133,13 +129,11 @@ def read_release_config(path: Path) -> dict[str, Any]:
     return {f"{part}.{name}": setting("model", part, name) for part, keys in names.items() for name in keys}
 
 
-def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size: int) -> Any:
+def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int) -> HumanGSConfig:
     """A checkpoint's configuration with what the release's one adds to it.
 
     Raises: ValueError naming a setting that does not agree with the checkpoint's shapes.
     """
-    from humangs_jax.network.config import paper_parts
-
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer
     found = {
@@ -173,13 +167,6 @@ def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
     """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j, 4, 4)."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.core.pytree import replace
-    from humangs_jax.geometry.camera import Camera
-    from humangs_jax.network.parts import HumanGSInputs
-
     own = lambda name: jnp.asarray(arrays[name][index], dtype)
     images = jnp.moveaxis(own("in_image"), 1, -1)
     height, width = images.shape[1:3]
@@ -206,17 +193,6 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
 
     And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see `nearest_candidates`.
     """
-    import flax.linen as nn
-    import jax.numpy as jnp
-
-    from humangs_jax.geometry import quaternion
-    from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.encoder import encoder_pixels, sample_triplane
-    from humangs_jax.network.humangs import intermediates, part_variables
-    from humangs_jax.network.maps import Convolution
-    from humangs_jax.network.vertex_decoder import corrected_skinning_weights
-    from humangs_jax.rendering.gaussians import skin_gaussians
-
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
     encoder, reader, decoder = paper_parts(config.architecture)
     stages = intermediates(variables, inputs, config)
@@ -262,8 +238,6 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
 
 def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> Any:
     """Ours of the posed rotations; where candidates tie to within `bound`, the one nearest to the reference."""
-    import numpy as np
-
     ours = np.asarray(found["posed_rotations"], np.float64)
     if TIES not in found or ours.shape != reference.shape:
         return ours
@@ -280,8 +254,6 @@ def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: floa
 
     bound: within which candidates of posed rotations tie.
     """
-    import numpy as np
-
     errors: dict[str, float | None] = {}
     for name, reference in expected.items():
         ours, reference = np.asarray(found.get(name, np.nan), np.float64), np.asarray(reference, np.float64)
@@ -296,27 +268,24 @@ def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: floa
     return errors
 
 
-def check(checkpoint: Path, arrays: Path, config: Path, dtype: str, render: bool = False) -> dict[str, Any]:
-    """The result that --json writes. For float64 `jax_enable_x64` must be set."""
-    found, expected = run_checkpoint(checkpoint, arrays, config, dtype)
+def check(checkpoint: Path, dtype: str, drawn: bool = False) -> dict[str, Any]:
+    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared}, "passed"}, and "render_psnr".
+
+    For float64 `jax_enable_x64` must be set.
+    """
+    found, expected = run_checkpoint(checkpoint, dtype)
     bound = BOUNDS[dtype]
     errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
     passed = all(error is not None and error <= bound for error in errors.values())
     result = {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
-    if render:
-        reference, _ = run_checkpoint(checkpoint, arrays, config, "float32")
-        result["render_psnr"] = render_psnr(found, reference, expected)
+    if drawn:
+        result["render_psnr"] = render_psnr(found, run_checkpoint(checkpoint, "float32")[0], expected)
     return result
 
 
-def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """(what `compute_stages` gives for all subjects, the arrays of the file)."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.network.conversion import load_checkpoint
-
+    config, arrays = (checkpoint.with_suffix(suffix) for suffix in (".json", ".npz"))
     release, expected = read_release_config(config), load_arrays(arrays)
     converted = load_checkpoint(checkpoint, head_width=_head_width(release))
     settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
@@ -345,13 +314,6 @@ def render_psnr(found: dict[str, Any], reference: dict[str, Any], arrays: dict[s
 
     Drawn as the release draws, RENDER_SIZE pixels high.
     """
-    import jax.numpy as jnp
-    import numpy as np
-
-    from humangs_jax.rendering.gaussians import Gaussians
-    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
-    from humangs_jax.rendering.splatting import render
-
     names = ("posed_means3D", "posed_rotations", "asset_scales", "asset_opacity", "asset_colors")
     worst = np.inf
     for index in range(len(arrays["in_image"])):
@@ -373,51 +335,51 @@ def _head_width(release: dict[str, Any]) -> int | None:
     return None if release["transformer.use_qk_norm"] is not False else release["transformer.d_head"]
 
 
-def report(result: dict[str, Any]) -> str:
-    """A table of the stages in their order, and a verdict."""
-    errors, bound = dict(result["stages"]), result["bound"]
-    lines = []
-    rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in errors]
-    rows += [("unknown stage", name) for name in errors if name not in {name for _, name in rows}]
-    for stage, name in rows:
-        error = errors[name]
-        verdict = "NOT COMPARED" if error is None else f"{error:12.2e}" + ("" if error <= bound else "  TOO LARGE")
-        lines.append(f"{stage:20s} {name:24s} {verdict}")
-    uncompared = sum(error is None for error in errors.values())
-    largest = max((error for error in errors.values() if error is not None), default=float("nan"))
-    verdict = f"{result['dtype']}: largest {largest:.2e}, allowed {bound:.0e}"
-    verdict += f", {uncompared} not compared" if uncompared else ""
-    if "render_psnr" in result:
-        lines.append(f"drawn, against float32: at least {result['render_psnr']:.1f} dB")
-    return "\n".join([*lines, f"{verdict}: {'ok' if result['passed'] else 'FAILED'}"])
+@entry
+def parity(
+    run: Run,
+    checkpoints: tuple[Path, ...],
+    dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
+    render: bool = False,
+) -> int:
+    """Checkpoints of the published network on stored inputs: the largest error of every stage, relative to its largest magnitude.
+
+    Beside a checkpoint STEM.pt, in the released format, or its state dict STEM.safetensors, are STEM.json, the release's
+    configuration, which says what shapes do not tell (pooling, width of a head), and STEM.npz with b subjects of v views:
+
+        in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4), in_smpl_canonical_vertices and
+        in_smpl_posed_vertices (b,v,n,3), in_joint_transforms (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map
+        (b,v,h,w,3) and in_depth_map (b,v,1,h,w) in normalised units
+        out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w), mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d),
+        mid_feature_map_stride4 (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
+        (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights (every fifth of n*k),
+        posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is free)
+
+    Exit status 1 if an error exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or an array of a stage (any that is not
+    in_*) could not be compared. Seconds for small networks.
+
+    Tables: parity_stages
+
+    Options:
+    dtypes: to compute in
+    render: also draw the results and compare them with float32's
+    """
+    columns = {}
+    for dtype in dtypes:
+        with jax.enable_x64(dtype == "float64"):
+            for path in checkpoints:
+                columns[f"{dtype}, {path.stem}"] = check(path, dtype, render)
+    found = list(dict.fromkeys(name for column in columns.values() for name in column["stages"]))
+    rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in found]
+    rows += [("unknown stage", name) for name in found if name not in {name for _, name in rows}]
+    table = [[stage, f"`{name}`", *(_shown(each, name) for each in columns.values())] for stage, name in rows]
+    text = markdown_table(["stage", "array", *columns], table, "ll" + "r" * len(columns))
+    drawn = [f"{name}: {each['render_psnr']:.1f} dB" for name, each in columns.items() if "render_psnr" in each]
+    text += f"\n\nDrawn, against float32, at least: {', '.join(drawn)}." if drawn else ""
+    run.show(text, columns, "parity_stages")
+    return int(not all(column["passed"] for column in columns.values()))
 
 
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", type=Path, metavar="CKPT.pt", help="checkpoint in the released format")
-    parser.add_argument("arrays", type=Path, metavar="ARRAYS.npz", help="inputs and the numbers of every stage")
-    parser.add_argument("config", type=Path, metavar="CONFIG.json", help="the release's configuration")
-    parser.add_argument("--dtype", choices=list(BOUNDS), default="float32", help="to compute in")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write the errors here")
-    parser.add_argument("--render", action="store_true", help="also draw the result and compare it with float32's")
-    arguments = parser.parse_args()
-
-    import jax
-
-    from experiments.results import write_json
-
-    jax.config.update("jax_enable_x64", arguments.dtype == "float64")
-    try:
-        result = check(arguments.checkpoint, arguments.arrays, arguments.config, arguments.dtype, arguments.render)
-        if arguments.json:
-            write_json(arguments.json, result)
-    except (ValueError, OSError) as error:
-        print(f"check_parity: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    print(report(result))
-    sys.exit(not result["passed"])
-
-
-if __name__ == "__main__":
-    main()
+def _shown(column: dict[str, Any], name: str) -> str:
+    error = column["stages"].get(name)
+    return "NOT COMPARED" if error is None else f"{error:.1e}" + ("" if error <= column["bound"] else " TOO LARGE")

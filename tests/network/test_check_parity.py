@@ -2,11 +2,8 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 
-import jax
 import network_golden as golden
 import network_oracle as oracle
 import numpy as np
@@ -14,6 +11,7 @@ import pytest
 from network_oracle import Options
 from torch_writer import tensors, write_checkpoint
 
+from experiments.harness import call
 from experiments.paper import check_parity
 
 GOLDEN = Path(__file__).parents[3] / "shared" / "golden"
@@ -33,28 +31,21 @@ VARIANTS = {
 SMALL = VARIANTS["neither class token nor upsampler, one layer"]
 
 
-@pytest.fixture(autouse=True)
-def precision():
-    """main() switches JAX to float64 and back by --dtype."""
-    yield
-    jax.config.update("jax_enable_x64", False)
-
-
 def write_triple(folder, options, change=lambda arrays: None):
     state, arrays, config = oracle.triple(options)
     change(arrays)
     write_checkpoint(folder / "a.pt", {"model": tensors(state)})
     np.savez(folder / "a.npz", **arrays)
     (folder / "a.json").write_text(json.dumps(config))
-    return folder / "a.pt", folder / "a.npz", folder / "a.json"
+    return folder / "a.pt"
 
 
-def run(monkeypatch, *arguments):
-    """Exit status of the script's main."""
-    monkeypatch.setattr(sys, "argv", ["check_parity.py", *map(str, arguments)])
-    with pytest.raises(SystemExit) as exit_:
-        check_parity.main()
-    return exit_.value.code
+def run(checkpoint, dtype="float32", *options):
+    """Exit status, and the column of the result."""
+    out = checkpoint.with_name("out.json")
+    given = [checkpoint, "--dtypes", dtype, *options, "--json", out]
+    code = call(check_parity.parity, [str(each) for each in given])
+    return code, json.loads(out.read_text())["numbers"]["parity_stages"][f"{dtype}, {checkpoint.stem}"]
 
 
 def test_the_oracle_is_the_published_network():
@@ -70,31 +61,27 @@ def test_the_oracle_is_the_published_network():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
-def test_every_option_of_the_network(name, tmp_path, monkeypatch, capsys):
+def test_every_option_of_the_network(name, tmp_path):
     options = VARIANTS[name]
-    triple = write_triple(tmp_path, options)
-    assert run(monkeypatch, *triple, "--dtype", "float64", "--json", tmp_path / "out.json") == 0, capsys.readouterr()
-    result = json.loads((tmp_path / "out.json").read_text())
-    assert result["dtype"] == "float64" and result["bound"] == 1e-6 and result["passed"] is True
+    code, result = run(write_triple(tmp_path, options), "float64")
+    assert code == 0 and result["bound"] == 1e-6 and result["passed"] is True
     assert len(result["stages"]) == 16 + options.upsampler
     assert max(result["stages"].values()) < 2e-7, result  # the numbers are stored as float32
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_other_precisions(dtype, tmp_path, monkeypatch, capsys):
-    triple = write_triple(tmp_path, dataclasses.replace(SMALL, layers=2, class_token=True))
-    draw = ["--render"] if dtype == "bfloat16" else []
-    assert run(monkeypatch, *triple, "--dtype", dtype, *draw, "--json", tmp_path / "out.json") == 0, capsys.readouterr()
-    result = json.loads((tmp_path / "out.json").read_text())
-    assert result["bound"] == {"float32": 2e-5, "bfloat16": 5e-2}[dtype]
+def test_other_precisions(dtype, tmp_path):
+    checkpoint = write_triple(tmp_path, dataclasses.replace(SMALL, layers=2, class_token=True))
+    code, result = run(checkpoint, dtype, *(["--render"] if dtype == "bfloat16" else []))
+    assert code == 0 and result["bound"] == {"float32": 2e-5, "bfloat16": 5e-2}[dtype]
     if dtype == "bfloat16":
         assert 45 < result["render_psnr"] < 200  # dB; equal images would be 300
         assert result["stages"]["mid_encoder_out"] > 1e-4  # else it were float32
         assert result["stages"]["out_ray_d"] < 1e-6
 
 
-def test_one_wrong_number_in_any_stage_fails(tmp_path, monkeypatch, capsys):
+def test_one_wrong_number_in_any_stage_fails():
     """The stages are computed once; each is spoilt in turn."""
     _, arrays, _ = oracle.triple(SMALL)
     expected = {name: x for name, x in arrays.items() if not name.startswith("in_")}
@@ -111,21 +98,19 @@ def test_one_wrong_number_in_any_stage_fails(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_what_is_not_compared_fails(tmp_path, monkeypatch, capsys):
+def test_what_is_not_compared_fails(tmp_path, capsys):
     def change(arrays):
         arrays["mid_something"] = np.zeros(3, np.float32)
         arrays["mid_tokens"] = arrays["mid_tokens"][:, :-1]
         arrays["asset_colors"][0, 0, 0] += 0.1
         del arrays["posed_means3D"]
 
-    triple = write_triple(tmp_path, SMALL, change)
-    assert run(monkeypatch, *triple, "--json", tmp_path / "out.json") == 1
-    result = json.loads((tmp_path / "out.json").read_text())
+    code, result = run(write_triple(tmp_path, SMALL, change))
     stages = result["stages"]
-    assert result["passed"] is False and stages["mid_something"] is None and stages["mid_tokens"] is None
+    assert code == 1 and result["passed"] is False and stages["mid_something"] is None and stages["mid_tokens"] is None
     assert stages["asset_colors"] > 0.05 and stages["mid_block_0"] < 2e-5 and "posed_means3D" not in stages
     printed = capsys.readouterr().out
-    assert printed.count("NOT COMPARED") == 2 and printed.count("TOO LARGE") == 1 and "FAILED" in printed
+    assert printed.count("NOT COMPARED") == 2 and printed.count("TOO LARGE") == 1
 
 
 def test_ties_of_posed_rotations_are_free_and_nothing_else_is():
@@ -153,23 +138,23 @@ def test_nothing_not_a_number_passes():
 
 
 def spoil(change):
-    return lambda paths: np.savez(paths[1], **change(dict(np.load(paths[1]))))
+    return lambda path: np.savez(path.with_suffix(".npz"), **change(dict(np.load(path.with_suffix(".npz")))))
 
 
 def reconfigure(part, **settings):
-    def change(paths):
-        config = json.loads(paths[2].read_text())
+    def change(path):
+        config = json.loads(path.with_suffix(".json").read_text())
         section = config["training"] if part == "training" else config["model"][part]
         section.update(settings)
-        paths[2].write_text(json.dumps(config))
+        path.with_suffix(".json").write_text(json.dumps(config))
 
     return change
 
 
 UNUSABLE = {
-    "no checkpoint": (lambda paths: paths[0].unlink(), "a.pt"),
-    "no arrays": (lambda paths: paths[1].write_bytes(b"no zip"), "a.npz"),
-    "no JSON": (lambda paths: paths[2].write_text("{"), "a.json"),
+    "no checkpoint": (lambda path: path.unlink(), "a.pt"),
+    "no arrays": (lambda path: path.with_suffix(".npz").write_bytes(b"no zip"), "a.npz"),
+    "no JSON": (lambda path: path.with_suffix(".json").write_text("{"), "a.json"),
     "an input missing": (spoil(lambda a: {k: x for k, x in a.items() if k != "in_c2w"}), "'in_c2w' is missing"),
     "an input of another shape": (spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}), "in_c2w has shape"),
     "an input not finite": (spoil(lambda a: a | {"in_image": a["in_image"] * np.nan}), "in_image"),
@@ -182,38 +167,27 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
-def test_unusable_inputs_are_one_line(case, tmp_path, monkeypatch, capsys):
+def test_unusable_inputs_are_one_line(case, tmp_path, capsys):
     change, message = UNUSABLE[case]
-    triple = write_triple(tmp_path, SMALL)
-    change(triple)
-    assert run(monkeypatch, *triple, "--json", tmp_path / "out.json") == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and message in error and not (tmp_path / "out.json").exists()
+    checkpoint = write_triple(tmp_path, SMALL)
+    change(checkpoint)
+    with pytest.raises(SystemExit) as exit_:
+        run(checkpoint)
+    assert exit_.value.code == 2 and message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out.json").exists()
 
 
-def test_a_checkpoint_may_be_safetensors(tmp_path, monkeypatch, capsys):
+def test_a_checkpoint_may_be_safetensors(tmp_path):
     from safetensors.numpy import save_file
 
-    _, arrays, config = write_triple(tmp_path, SMALL)
-    save_file(
-        {key: np.ascontiguousarray(x) for key, x in oracle.random_state(SMALL).items()}, tmp_path / "a.safetensors"
-    )
-    assert run(monkeypatch, tmp_path / "a.safetensors", arrays, config) == 0, capsys.readouterr()
-
-
-def test_help_imports_nothing_heavy():
-    script = check_parity.__file__
-    code = "import sys, runpy; sys.argv = ['check_parity.py', '--help']\n"
-    code += f"try: runpy.run_path({str(script)!r}, run_name='__main__')\n"
-    code += "except SystemExit: pass\nassert 'jax' not in sys.modules and 'numpy' not in sys.modules"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0 and "CKPT.pt" in result.stdout, result.stderr
+    tensors_of = {key: np.ascontiguousarray(x) for key, x in oracle.random_state(SMALL).items()}
+    save_file(tensors_of, write_triple(tmp_path, SMALL).with_suffix(".safetensors"))
+    assert run(tmp_path / "a.safetensors")[0] == 0
 
 
 @pytest.mark.skipif(not GOLDEN.exists(), reason="no golden data beside this checkout")
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", check_parity.BOUNDS)
 @pytest.mark.parametrize("name", ["golden_a", "golden_b"])
-def test_the_golden_data_in_full(name, dtype, monkeypatch, capsys):
-    paths = [GOLDEN / f"{name}.{suffix}" for suffix in ("pt", "npz", "json")]
-    assert run(monkeypatch, *paths, "--dtype", dtype) == 0, capsys.readouterr()
+def test_the_golden_data_in_full(name, dtype):
+    assert call(check_parity.parity, [str(GOLDEN / f"{name}.pt"), "--dtypes", dtype]) == 0

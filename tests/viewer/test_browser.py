@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments import chromium
 from experiments import page as evaluation
+from experiments.subjects import shipped_person
 from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, RestBody, joint_transforms
 from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform
@@ -34,7 +35,7 @@ ANGLE = 2e-3
 
 @pytest.fixture(scope="module")
 def avatar():
-    return evaluation.shipped_person()
+    return shipped_person()
 
 
 @pytest.fixture(scope="module")
