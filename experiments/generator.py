@@ -1,20 +1,26 @@
-"""What is wrong with synthetic people, and how much they differ."""
+"""Synthetic people: what is wrong with them, how much they differ, contact sheets."""
 
-import collections
-import colorsys
-import dataclasses
+import functools
 from pathlib import Path
+from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
-from experiments.harness import Run, entry, figure
+from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.resolution import decimate
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.people import anatomy, cameras
-from humangs_jax.people.subject import describe, make_subject, padded, render_view
-from humangs_jax.people.writer import sample_pose
+from humangs_jax.people.anatomy import Rotations
+from humangs_jax.people.subject import DEMO, describe, make_subject, padded, pose_subject, render_view
+from humangs_jax.people.writer import sample_motion, sample_pose
+from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
@@ -28,150 +34,76 @@ FAULTS = {
     "hollow": "the inner side of cloth is seen where the naked body would be at least 1 cm nearer: one looks into empty clothes",
     "gaps": "the background is seen where the naked body would be",
 }
-SPREADS = {
-    "stature": ("stature, m", 2),
-    "years": ("years", 0),
-    "weight": ("weight coefficient", 2),
-    "muscle": ("muscle coefficient", 2),
-    "skin_brightness": ("brightness of the skin", 2),
-    "foreground_share": ("share of the picture that is person", 3),
-}
-"""Rows of the table of diversity, and their digits."""
 DEEP = 0.01
 """Metres inside of a hem: deep."""
-SHARE_BINS = 40
-
-
-@dataclasses.dataclass(frozen=True)
-class Looked:
-    """Options:
-    subjects: people that are built, posed and rendered
-    described: people whose descriptions are counted
-    poses: of every built person
-    views: cameras around every pose
-    size: side of the pictures
-    first: first seed (training people by default)
-    """
-
-    subjects: int = 1000
-    described: int = 1000
-    poses: int = 1
-    views: int = 1
-    size: int = 256
-    first: int = 0
 
 
 @entry
-def people_faults(run: Run, options: Looked = Looked(), plots: Path | None = None, worst: int = 0) -> None:
-    """What is wrong with synthetic people, and how much they differ; also the table people_diversity.
+def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0, worst: int = 0) -> None:
+    """Faults of synthetic people: counted in images of random poses from random cameras, as shares of the person's pixels.
 
-    Faults are counted in images of random poses from random cameras, as shares of the person's pixels. Skin seen up a sleeve or
-    under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in the mesh at all and
-    cannot poke: see hollow. Diversity is that of descriptions (a millisecond each) and of images. 1,000 descriptions take 3 s,
-    1,000 subjects with images about 15 minutes on 2 CPU cores. Expected: poking below 0.1 %.
+    Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in
+    the mesh at all and cannot poke: see hollow. A second a person. Expected: poking below 0.1 %.
 
     Options:
-    plots: the diversity plots
+    subjects: people that are built, posed and rendered
+    size: side of the pictures
+    first: first seed (training people by default)
     worst: print so many seeds with most faults
     """
     body = load_body()
-    people = describe_all(body, options)
-    seen, faults = look_at_all(body, options)
-    result = people["numbers"] | seen["numbers"]
+    cases = {str(first + i): functools.partial(look_at, body, first + i, size) for i in range(subjects)}
+    rows = run.rows(cases, {"size": size})
     for name in ("poking", "hollow", "gaps") if worst else ():
-        ranked = sorted(faults, key=lambda row: -row[name])[:worst]
-        print(name, [(row["seed"], row["pose"], f"{row[name]:.2%}") for row in ranked])
-    rows = []
+        print(name, [(seed, f"{rows[seed][name]:.2%}") for seed in sorted(rows, key=lambda s: -rows[s][name])[:worst]])
+    numbers, table, pixels = {}, [], np.asarray([row["pixels"] for row in rows.values()])
     for name, definition in FAULTS.items():
-        mean, most, poses = (result[name][key] for key in ("mean", "worst", "poses_above_0.1_percent"))
-        rows.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{poses:.1%}"])
-    text = markdown_table(["fault", "definition", "mean", "worst pose", "poses above 0.1 %"], rows, "lllll")
-    run.show(text, {name: result[name] for name in FAULTS})
-    rows = [[label, *(f"{x:.{digits}f}" for x in result[name].values())] for name, (label, digits) in SPREADS.items()]
-    marks = ["mean", "standard deviation", "least", "5 %", "median", "95 %", "most"]
-    header = [f"of {result['described']:,} people", *marks]
-    run.show(markdown_table(header, rows, "l" * len(header)), result, "people_diversity")
-    if plots:
-        draw(plots, people, seen)
+        each = np.asarray([row[name] for row in rows.values()])
+        mean, most, above = float((each * pixels).sum() / pixels.sum()), float(each.max()), float((each > 1e-3).mean())
+        numbers[name] = {"mean": mean, "worst": most, "above_0.1_percent": above}
+        table.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{above:.1%}"])
+    header = ["fault", "definition", "mean", "worst person", f"of {subjects} people above 0.1 %"]
+    run.show(markdown_table(header, table, "lllll"), {"people": subjects} | numbers)
 
 
-def describe_all(body, options):
-    """Counts and spreads over descriptions."""
-    people = [describe(options.first + i, body) for i in range(options.described)]
-    kinds = collections.Counter(g.kind for p in people for g in p.garments)
-    patterns = collections.Counter(g.fabric.pattern for p in people for g in p.garments)
-    cuts = collections.Counter(p.haircut.cut for p in people)
-    beards = collections.Counter(p.haircut.beard for p in people)
-    betas = np.stack([p.betas for p in people])
-    stature, years = np.asarray([p.stature for p in people]), np.asarray([p.years for p in people])
-    skin = np.stack([p.complexion.skin for p in people])
-    hues = _hues(np.stack([g.fabric.base for p in people for g in p.garments]))
-    outfits = {tuple(sorted(g.kind for g in p.garments)) for p in people}
-    numbers = {
-        "described": len(people),
-        "men": float(np.mean([p.male for p in people])),
-        "stature": _spread(stature),
-        "years": _spread(years),
-        "weight": _spread(betas[:, body.shape_names.index("weight")]),
-        "muscle": _spread(betas[:, body.shape_names.index("muscle")]),
-        "shape_standard_deviations": dict(zip(body.shape_names, np.round(betas.std(0), 2).tolist(), strict=True)),
-        "skin_brightness": _spread(skin.mean(1)),
-        "garment_kinds": len(kinds),
-        "garments": dict(kinds.most_common()),
-        "garments_per_person": float(np.mean([len(p.garments) for p in people])),
-        "different_sets_of_garments": len(outfits),
-        "patterns": dict(patterns.most_common()),
-        "haircuts": dict(cuts.most_common()),
-        "beards": dict(beards.most_common()),
-        "dyes_by_hue": hues,
+def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
+    """Pixels of one person in one pose, and shares of faults."""
+    posed = sample_pose(make_subject(seed, body), 0)
+    rng = np.random.default_rng([seed, 77, 0])
+    camera = cameras.cameras_around(rng, posed.vertices, cameras.spread_azimuths(rng, 1), size)[0]
+    pixels, *counts = count_faults(body, posed, camera)
+    return {"pixels": float(pixels)} | {name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)}
+
+
+@entry
+def people_diversity(run: Run, people: int = 1000, first: int = 0) -> None:
+    """How much synthetic people differ, by their descriptions. Seconds.
+
+    Options:
+    people: how many
+    first: first seed (training people by default)
+    """
+    body = load_body()
+    described = [describe(first + i, body) for i in range(people)]
+    betas, marks = np.stack([p.betas for p in described]), {}
+    spreads = {
+        "stature, m": ([p.stature for p in described], 2),
+        "years": ([p.years for p in described], 0),
+        "weight coefficient": (betas[:, body.shape_names.index("weight")], 2),
+        "muscle coefficient": (betas[:, body.shape_names.index("muscle")], 2),
+        "brightness of the skin": ([p.complexion.skin.mean() for p in described], 2),
+        "garments and accessories": ([len(p.garments) for p in described], 1),
     }
-    return {
-        "numbers": numbers,
-        "stature": stature,
-        "years": years,
-        "betas": betas,
-        "male": [p.male for p in people],
-        "skin": skin,
-    }
-
-
-def look_at_all(body, options):
-    """Faults, foreground shares, colors and angles of built people; and a row of faults for every pose."""
-    rows, colors, angles, shares = [], np.zeros((12, 4, 4)), [], []
-    for i in range(options.subjects):
-        seed = options.first + i
-        subject = make_subject(seed, body)
-        for pose in range(options.poses):
-            posed = sample_pose(subject, pose)
-            angles.append(np.linalg.norm(posed.rotations, axis=1))
-            rng = np.random.default_rng([seed, 77, pose])
-            batch = cameras.cameras_around(
-                rng, posed.vertices, cameras.spread_azimuths(rng, options.views), options.size
-            )
-            counts = np.zeros(1 + len(FAULTS))
-            for k in range(options.views):
-                counts += count_faults(body, posed, batch[k])
-                if pose == 0 and k == 0:
-                    image, mask = render_view(posed, batch[k])
-                    colors += _color_histogram(image[mask == 1])
-                    shares.append(float(mask.mean()))
-            rows.append(
-                {"seed": seed, "pose": pose, "pixels": counts[0]}
-                | dict(zip(FAULTS, counts[1:] / counts[0], strict=True))
-            )
-    pixels = np.asarray([row["pixels"] for row in rows])
-    numbers: dict = {"built": options.subjects, "pictures": len(rows) * options.views}
-    for name in FAULTS:
-        each = np.asarray([row[name] for row in rows])
-        numbers[name] = {
-            "mean": float((each * pixels).sum() / pixels.sum()),
-            "worst": float(each.max()),
-            "poses_above_0.1_percent": float((each > 1e-3).mean()),
-        }
-    numbers["foreground_share"] = _spread(np.asarray(shares))
-    numbers["colour_cells_used"] = float((colors / colors.sum() > 1e-3).mean())
-    angles = np.stack(angles)
-    return {"numbers": numbers, "colours": colors, "angles": angles, "shares": np.asarray(shares)}, rows
+    header, table = ["mean", "standard deviation", "least", "5 %", "median", "95 %", "most"], []
+    for name, (values, digits) in spreads.items():
+        found = [np.mean(values), np.std(values), *np.percentile(values, [0, 5, 50, 95, 100])]
+        marks[name] = dict(zip(header, map(float, found), strict=True))
+        table.append([name, *(f"{x:.{digits}f}" for x in found)])
+    kinds = {g.kind for p in described for g in p.garments}
+    outfits = {tuple(sorted(g.kind for g in p.garments)) for p in described}
+    said = f"{len(kinds)} kinds of garments and accessories, {len(outfits)} different sets of them."
+    text = markdown_table([f"of {people:,} people", *header], table, "l" * 8)
+    run.show(f"{text}\n\n{said}", {"spreads": marks, "kinds": len(kinds), "sets": len(outfits)})
 
 
 def count_faults(body, posed, camera):
@@ -207,71 +139,199 @@ def _faces_the_eye(vertices, faces, eye):
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
 
 
-def _spread(values):
+# Self-penetration ----------------------------------------------------------------------------------------------------
 
-    marks = dict(
-        zip(
-            ("least", "5_percent", "median", "95_percent", "most"),
-            np.percentile(values, [0, 5, 50, 95, 100]),
-            strict=True,
-        )
-    )
-    marks = {"mean": values.mean(), "standard_deviation": values.std(), **marks}
-    return {name: round(float(value), 4) for name, value in marks.items()}
+OUTSIDE = 2e-3
+"""Metres along the normal at which a vertex asks."""
+INSIDE = 0.6
+"""Winding number above which a point is inside: meshes are not quite closed (mouth, eyes)."""
+AT_ONCE = 64
 
 
-def _hsv(colors):
-    """(n, 3) hue, saturation, value of (n, 3) colors."""
-    high, low = colors.max(-1), colors.min(-1)
-    chroma = np.maximum(high - low, 1e-9)
-    r, g, b = colors.T
-    hue = np.select([high == r, high == g], [((g - b) / chroma) % 6, (b - r) / chroma + 2], (r - g) / chroma + 4) / 6
-    return np.stack([hue % 1, (high - low) / np.maximum(high, 1e-9), high], -1)
+def winding_numbers(
+    points: Float[Array, "q 3"], vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]
+) -> Float[Array, " q"]:
+    """How often the mesh winds around each point (q, 3): sum of the signed solid angles of its faces over 4 pi."""
+    corners = vertices[faces]
+    dot = lambda x, y: jnp.sum(x * y, axis=-1)
+
+    def one(point):
+        a, b, c = (corners[:, i] - point for i in range(3))
+        la, lb, lc = (jnp.linalg.norm(x, axis=-1) for x in (a, b, c))
+        below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+        return jnp.sum(2 * jnp.arctan2(dot(a, jnp.cross(b, c)), below)) / (4 * jnp.pi)
+
+    return jax.lax.map(one, points, batch_size=AT_ONCE)
 
 
-def _hues(colors):
-    """Shares of dyes: neutral ones and 12 hues."""
-    hue, saturation, _ = _hsv(colors).T
-    colored = saturation > 0.15
-    counts = np.bincount((hue[colored] * 12).astype(int) % 12, minlength=12)
-    names = ["red", "orange", "yellow", "lime", "green", "sea", "cyan", "azure", "blue", "violet", "magenta", "rose"]
-    shares = {"neutral": round(float((~colored).mean()), 3)}
-    return shares | {name: round(float(c) / len(colors), 3) for name, c in zip(names, counts, strict=True)}
+class OverlapMeter:
+    """Asks the vertices of a body, decimated to `count`; those that are inside in T-pose already do not count."""
+
+    def __init__(self, body: BodyModel, count: int = 1600):
+        self.body = decimate(body, count)
+        self.rest = shape_body(self.body, jnp.zeros(0))
+        self.at_rest = np.zeros(len(self.body.template), bool)
+        self.at_rest = self.inside(np.zeros((len(body.parents), 3)))
+
+    def inside(self, rotations: Rotations) -> Bool[np.ndarray, " n"]:
+        """The vertices (n,) that a pose of rotation vectors (j, 3) puts inside another part of the body."""
+        return np.asarray(_inside(self.body, self.rest, jnp.asarray(rotations, jnp.float32))) & ~self.at_rest
 
 
-def _color_histogram(pixels):
-    """(12, 4, 4) counts of hue, saturation, value, each image with the same weight."""
-    cells = np.minimum((_hsv(pixels) * [12, 4, 4]).astype(int), [11, 3, 3])
-    counts = np.zeros((12, 4, 4))
-    np.add.at(counts, tuple(cells.T), 1 / max(len(pixels), 1))
-    return counts
+@jax.jit
+def _inside(body, rest, rotations):
+    vertices = pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices
+    points = vertices + OUTSIDE * vertex_normals(vertices, body.faces)
+    return winding_numbers(points, vertices, body.faces) > INSIDE
 
 
-def draw(file, people, seen):
-    """One image of eight plots."""
-    male, numbers = np.asarray(people["male"]), people["numbers"]
-    with figure(file, 4, (17, 9.5), rows=2) as axes:
-        (stature, years, build, share), (worn, woven, hue, bent) = axes
-        for values, name, ax in ((people["stature"], "stature, m", stature), (people["years"], "years", years)):
-            ax.hist([values[male], values[~male]], 30, stacked=True, label=["men", "women"])
-            ax.set_xlabel(name)
-            ax.legend()
-        build.scatter(people["stature"], people["betas"][:, 2], s=6, c=np.clip(people["skin"], 0, 1))
-        build.set(xlabel="stature, m", ylabel="weight coefficient (color: skin)")
-        share.hist(seen["shares"], SHARE_BINS)
-        share.set_xlabel("share of the picture that is person")
-        patterned = {k: v for k, v in numbers["patterns"].items() if k != "plain"}
-        for kinds, ax, label in (
-            (numbers["garments"], worn, f"garments among {numbers['described']} people"),
-            (patterned, woven, f"patterns (plain: {numbers['patterns']['plain']})"),
-        ):
-            ax.barh(list(kinds)[::-1], list(kinds.values())[::-1])
-            ax.set_xlabel(label)
-        shares = seen["colours"].sum((1, 2)) / seen["colours"].sum()
-        hue.bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
-        hue.set_xlabel("hue of the person's pixels")
-        joints = {"hip": anatomy.LEFT_HIP, "knee": anatomy.LEFT_KNEE, "shoulder": anatomy.LEFT_SHOULDER}
-        joints |= {"elbow": anatomy.LEFT_ELBOW, "spine": anatomy.SPINE2, "neck": anatomy.NECK}
-        angles = [np.rad2deg(seen["angles"][:, j]) for j in joints.values()]
-        bent.boxplot(angles, tick_labels=list(joints), showfliers=False)
-        bent.set_ylabel("joint angle, degrees")
+# Contact sheets ------------------------------------------------------------------------------------------------------
+
+FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
+"""Width and height of one image, pixels."""
+COLUMNS = 16
+MOTION_FRAMES = 75
+QUALITY = 85
+TELE = 0.42
+"""Vertical field of view of images that show the whole person, radians."""
+
+
+@entry
+def people_sheets(
+    run: Run,
+    out: Path = Path("docs/images"),
+    sheets: tuple[Literal["front_back", "views", "close", "sequences"], ...] = (
+        "front_back",
+        "views",
+        "close",
+        "sequences",
+    ),
+    subjects: int = 64,
+    scale: float = 1.0,
+    suffix: Literal[".jpg", ".png"] = ".jpg",
+) -> None:
+    """Contact sheets of synthetic people: front and back, 16 of them all around, 8 heads and hands, 8 sequences of 8 frames.
+
+    All four take 90 s of one CPU core. The same command gives the same images bit for bit on the same machine.
+
+    Options:
+    out: folder to write into
+    sheets: which
+    subjects: people on the first sheet, of the demo seeds
+    scale: size of the pictures
+    suffix: kind of file
+    """
+    body = load_body()
+    out.mkdir(parents=True, exist_ok=True)
+    counts = {"front_back": subjects, "views": 16, "close": 8, "sequences": 8}
+    makers = {"front_back": front_back, "views": all_around, "close": close_ups, "sequences": motions}
+    for i, name in enumerate(counts):
+        if name in sheets:
+            sheet = makers[name](body, DEMO[100 * i : 100 * i + counts[name]], scale)
+            pixels, file = np.round(np.clip(sheet, 0, 1) * 255).astype(np.uint8), out / f"people_{name}{suffix}"
+            Image.fromarray(pixels).save(file, quality=QUALITY)  # of a JPEG
+            print(f"{file}: {sheet.shape[1]} x {sheet.shape[0]}, {file.stat().st_size / 1e3:.0f} kB")
+
+
+def front_back(body, seeds, scale):
+    """Rows of people from the front, each over a row of the same people from behind."""
+    cells = []
+    for seed in seeds:
+        posed = _person(seed, body)
+        turn = posed.rotations[0, 1]
+        cells.append([_whole(posed, turn + a, FRONT_BACK_SIZE, scale) for a in (0.25, np.pi + 0.25)])
+    rows = []
+    for start in range(0, len(cells), COLUMNS):
+        chosen = cells[start : start + COLUMNS]
+        rows += [[pair[0] for pair in chosen], [pair[1] for pair in chosen]]
+    return _grid(rows)
+
+
+def all_around(body, seeds, scale):
+    """One row a person, eight views around; two people side by side."""
+    rows = []
+    for seed in seeds:
+        posed = _person(seed, body)
+        azimuths = posed.rotations[0, 1] + np.arange(8) * (np.pi / 4)
+        rows.append([_whole(posed, a, VIEW_SIZE, scale) for a in azimuths])
+    half = (len(rows) + 1) // 2
+    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
+
+
+def close_ups(body, seeds, scale):
+    """A row of heads, a row of the same heads from the side, a row of hands."""
+    rows = [[], [], []]
+    for seed in seeds:
+        posed = _person(seed, body)
+        world, joints = anatomy.joint_positions(posed.subject.build, posed.rotations.astype(float))
+        joints = joints + posed.translation
+        facing = _azimuth(world[anatomy.HEAD] @ [0, 0, 1])
+        middle = joints[anatomy.HEAD] + world[anatomy.HEAD] @ [0, 0.085, 0.02]
+        rows[0].append(_near(posed, middle, 0.17, facing + 0.35, 0.05, scale))
+        rows[1].append(_near(posed, middle, 0.17, facing + 1.6, 0.05, scale))
+        hand = anatomy.LEFT_WRIST if seed % 2 else anatomy.RIGHT_WRIST
+        knuckles = joints[anatomy.LEFT_HAND + 3 if seed % 2 else anatomy.RIGHT_HAND + 3]
+        outwards = _azimuth(knuckles - joints[anatomy.SPINE2])
+        rows[2].append(_near(posed, 0.4 * joints[hand] + 0.6 * knuckles, 0.15, outwards, 0.1, scale))
+    return _grid(rows)
+
+
+def motions(body, seeds, scale):
+    """One row a sequence, eight frames over two and a half seconds, the camera beside the walker; two sequences side by side."""
+    rows = []
+    for seed in seeds:
+        subject = make_subject(seed, body)
+        motion = sample_motion(subject, MOTION_FRAMES)
+        rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
+        frames = np.linspace(0, len(rotations) - 1, 8).astype(int)
+        start = pose_subject(subject, rotations[0], translations[0])
+        facing = _azimuth(poses_world(subject, rotations[0]) @ [0, 0, 1])
+        posed = [start if i == 0 else pose_subject(subject, rotations[i], translations[i]) for i in frames]
+        rows.append([_whole(p, facing + 0.7, VIEW_SIZE, scale) for p in posed])
+    half = (len(rows) + 1) // 2
+    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
+
+
+def poses_world(subject, rotations):
+    """(3, 3) rotation of the pelvis."""
+    return anatomy.joint_positions(subject.build, rotations.astype(float))[0][anatomy.PELVIS]
+
+
+def _person(seed, body, pose=0):
+
+    return sample_pose(make_subject(seed, body), pose)
+
+
+def _azimuth(direction):
+
+    return float(np.arctan2(direction[0], direction[2]))
+
+
+def _camera(target, distance, azimuth, elevation, fov, size, scale):
+
+    width, height = (2 * round(s * scale / 2) for s in size)
+    K = intrinsics_from_fov(fov, width, height)
+    azimuths = jnp.asarray([azimuth], jnp.float32)
+    return orbit(jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, width, height)[0]
+
+
+def _whole(posed, azimuth, size, scale):
+    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the image's height."""
+    low, high = posed.vertices.min(0), posed.vertices.max(0)
+    reach = max(2.25, 1.1 * (high[1] - low[1]))
+    target = [0.5 * (low[0] + high[0]), low[1] + 0.455 * reach, 0.5 * (low[2] + high[2])]
+    distance = 0.5 * reach / np.tan(0.5 * TELE) + 0.3
+    return render_view(posed, _camera(target, distance, azimuth, 0.05, TELE, size, scale))[0]
+
+
+def _near(posed, target, reach, azimuth, elevation, scale):
+    """A close-up of `reach` metres around a point, from a metre away."""
+    fov = 2 * np.arctan(reach / 1.2)
+    return render_view(posed, _camera(target, 1.2, azimuth, elevation, fov, CLOSE_SIZE, scale))[0]
+
+
+def _grid(rows):
+    """(h, w, 3) image of rows of images of one size; short rows are filled with white."""
+    columns = max(len(row) for row in rows)
+    blank = np.ones_like(rows[0][0])
+    return np.concatenate([np.concatenate(row + [blank] * (columns - len(row)), axis=1) for row in rows], axis=0)

@@ -7,13 +7,13 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.costs import costs_of, temporary_mb
+from experiments.costs import Costs, costs_of, temporary_mb
 from experiments.harness import Run, entry, figure
 from experiments.reconstruction import foreground, matmul_program, random_variables
 from experiments.results import markdown_table
@@ -26,6 +26,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.perceptual import BACKBONES, VGG19, Convolution, Lpips, Vgg19, channels, convolutions
 from humangs_jax.people.writer import Layout, write_person
+from humangs_jax.training import sharding
 from humangs_jax.training.config import PRESETS
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import seed_numbers, update
@@ -46,37 +47,9 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     )
 
 
-def with_model(config: Any, upsampler: Any = None, **runtime: Any) -> Any:
-    """With other fields of the network's `Runtime`, or with an upsampler in proportion to the network."""
-    model = config.model.with_runtime(**runtime)
-    if upsampler is not None:
-        encoder, reader = model.architecture.encoder, model.architecture.reader
-        model = model.with_parts(
-            encoder=dataclasses.replace(encoder, upsampler=upsampler),
-            reader=dataclasses.replace(reader, output_width=encoder.transformer.width),
-        )
-    return dataclasses.replace(config, model=model)
-
-
-def abstract_batch(config: Any, joints: int, betas: int) -> Any:
-    """Shapes of an `Example` with a leading axis of `config.batch_size` subjects."""
-
-    def views(count: int, size: int):
-        camera = lambda K, pose: Camera(K, pose, size, size)
-        return SubjectViews(
-            images=jnp.zeros((count, size, size, 3)),
-            masks=jnp.zeros((count, size, size)),
-            cameras=jax.vmap(camera)(jnp.zeros((count, 3, 3)), jnp.zeros((count, 4, 4))),
-            rotations=jnp.zeros((count, joints, 3)),
-            translations=jnp.zeros((count, 3)),
-            betas=jnp.zeros(betas),
-        )
-
-    def example(_):
-        inputs = views(config.views.input_counts[0], config.model.conventions.image_size)
-        return Example(inputs, views(config.views.target_count, config.target_size))
-
-    return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
+def with_model(config: Any, **runtime: Any) -> Any:
+    """With other fields of the network's `Runtime`."""
+    return dataclasses.replace(config, model=config.model.with_runtime(**runtime))
 
 
 def random_weights(key: Any, slices: Any) -> Any:
@@ -128,40 +101,26 @@ class Case:
         if dtype == "auto":
             dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
         self.config = with_model(settings(preset, size, views, targets, batch), dtype=dtype)
-        self.program: Any = None
-        self.full_body = load_body()
         self.networks = random_networks(self.config)
 
     def prepare(self, folder: Path) -> "Case":
-        """Makes the person, reads the batch, draws the weights."""
-        config = self.config
-        self.capture = written_subject(folder, config, self.full_body)
-        self.loader = Loader(self.source(), config.batch_size)
-        self.body = gaussian_body(self.full_body, config.model)
-        self.batch = jax.block_until_ready(self.loader.batch_at(0))
-        self.fit()
-        self.state = fresh_state(config)
+        """Makes the person, reads the batch, draws the weights; room for the person's foreground tokens, as a run would have."""
+        config, body = self.config, load_body()
+        size = config.model.conventions.image_size
+        cache = CaptureCache([written_subject(folder, config, body)], body)
+        source = CaptureSource(cache, config.views, size, config.target_size)
+        self.body = gaussian_body(body, config.model)
+        self.batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
+        if config.model.tokens == "foreground":
+            first = jax.tree.map(lambda x: x[0], self.batch)
+            inputs = jax.jit(prepare_inputs, static_argnames="config")(self.body, first.inputs, config.model)
+            room = foreground(inputs, config.model)[0].runtime.token_capacity
+            self.config = with_model(config, token_capacity=room)
+        self.state = init_state(self.config, random_variables(self.config.model))
         return self
 
-    def source(self) -> Any:
-        """Examples of the person; nothing is read yet."""
-        cache = CaptureCache([self.capture], self.full_body)
-        return CaptureSource(
-            cache, self.config.views, self.config.model.conventions.image_size, self.config.target_size
-        )
-
-    def fit(self) -> None:
-        """Room for the foreground tokens of this person, as a run would have."""
-        if self.config.model.tokens == "foreground":
-            inputs = jax.jit(prepare_inputs, static_argnames="config")(
-                self.body, first(self.batch).inputs, self.config.model
-            )
-            self.config = with_model(
-                self.config, token_capacity=foreground(inputs, self.config.model)[0].runtime.token_capacity
-            )
-
-    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Any]:
-        """(the step as a program, CPU seconds that it took to trace and compile, its `Costs`)."""
+    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Costs]:
+        """(the step as a program, CPU seconds that it took to trace and compile, its operations)."""
         static = ("config", "mesh")
         step = jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
         start = time.process_time()
@@ -176,103 +135,46 @@ class Case:
         self.metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
 
 
-def fresh_state(config: Any) -> Any:
-    """A training state of random weights."""
-    return init_state(config, random_variables(config.model))
-
-
-def first(batch: Any) -> Any:
-    """Its first subject."""
-    return jax.tree.map(lambda x: x[0], batch)
-
-
-def steps_table(result: dict[str, Any]) -> str:
-    """One line per case. The share is of CPU time on a CPU, which others use, too, and of wall time elsewhere."""
-    header = ["one subject a step", "tokens", "Gaussians", "wall, CPU s", "samples/s", "TFLOP", "share of floor"]
-    header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
-    rows = [
-        [
-            name,
-            row["tokens"],
-            row["gaussians"],
-            f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
-            f"{row['samples_per_s']:.3f}",
-            f"{row['flops'] / 1e12:.2f}",
-            f"{row['share_of_floor_cpu' if row['device'] == 'cpu' else 'share_of_floor']:.2f}",
-            f"{row['temporary_mb']:.0f}",
-            f"{row['peak_rss_mb']:.0f}",
-            f"{row['compile_cpu_s']:.0f}",
-        ]
-        for name, row in result.items()
-    ]
-    machines = "; ".join(
-        f"{name}: {row['dtype']}, {row['device']}, jax {row['jax']}, products {row['matmul_gflops']:.0f} GFLOP/s (wall), "
-        f"load {row['load_average']:.1f}, {row['repeats']} timed"
-        for name, row in result.items()
-    )
-    return markdown_table(header, rows) + f"\n\n{machines}."
-
-
-SMOOTHING = 20
-"""Log lines that a point of the smooth curves averages, at most a quarter of all."""
-
-
 @entry
-def training_steps(
-    run: Run,
-    only: tuple[str, ...] = tuple(CASES)[:3],
-    views: int | None = None,
-    targets: int | None = None,
-    dtype: Literal["auto", "float32", "bfloat16"] = "auto",
-    repeats: int = 3,
-) -> None:
+def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: int = 3) -> None:
     """Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
 
     A synthetic person is made and read by the loader; all weights are random, also those of loss networks. Operations are counted
     from the traced step, loops included. The floor is the time that these operations take as plain products in the same turns.
-    All
-    cases: half an hour on 2 idle cores.
+    `small` takes two minutes on 2 cores, `published` half an hour.
 
     Options:
     only: of "small 256", "published 256", "published 512", "tiny 32"
-    views: input views, instead of the case's
-    targets: target views, instead of the case's
-    dtype: auto: float32 on a CPU
     repeats: timed iterations
     """
     if unknown := set(only) - set(CASES):
         raise ValueError(f"--only: {unknown.pop()} is none of {', '.join(CASES)}")
-    cases = {}
-    for name in only:
-        preset, size, *counts = CASES[name]
-        inputs, wanted = views or counts[0], targets or counts[1]
-        make = functools.partial(Case, preset, size, inputs, wanted, dtype)
-        cases[f"{name}, {inputs} + {wanted} views"] = lambda make=make: step_numbers(make(), repeats)
-    rows = run.rows(cases, {"dtype": dtype, "repeats": repeats})
-    run.show(steps_table(rows), rows)
+    cases = {f"{n}, {CASES[n][2]} + {CASES[n][3]} views": functools.partial(step_numbers, n, repeats) for n in only}
+    rows, table = run.rows(cases, {"repeats": repeats}), []
+    for name, row in rows.items():
+        cells = [row["tokens"], f"{row['gaussians']:,}", f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}"]
+        cells += [f"{row['flops'] / 1e12:.2f}", f"{row['share_of_floor_cpu']:.2f}", f"{row['temporary_mb']:.0f}"]
+        table.append([name, *cells, f"{row['peak_rss_mb']:.0f}", f"{row['compile_cpu_s']:.0f}"])
+    header = ["one subject a step", "tokens", "Gaussians", "wall, CPU s", "TFLOP", "share of floor (CPU)"]
+    run.show(markdown_table([*header, "MiB temporaries", "peak MiB", "compile, CPU s"], table), rows)
 
 
-def step_numbers(case: Case, repeats: int) -> dict[str, Any]:
+def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     """Of the whole step."""
     jax.config.update("jax_enable_compilation_cache", False)
     with tempfile.TemporaryDirectory() as folder:
-        case.prepare(Path(folder))
+        case = Case(*CASES[name], "auto").prepare(Path(folder))
         program, compile_s, costs = case.compiled(compiler_options())
         product, product_flops = matmul_program(case.config.model.runtime.dtype)
-        load = os.getloadavg()[0]
         times = medians({"matmul": product, "step": lambda: case.run(program)}, repeats)
-    wall, cpu = map(float, times["step"])
-    floor, model = costs.flops / product_flops * times["matmul"], case.config.model
-    patches = (
-        case.config.views.input_counts[0] * (model.conventions.image_size // model.architecture.encoder.patch_size) ** 2
-    )
+    (wall, cpu), model = map(float, times["step"]), case.config.model
+    floor = costs.flops / product_flops * times["matmul"]
+    side = model.conventions.image_size // model.architecture.encoder.patch_size
+    patches = case.config.views.input_counts[0] * side**2
     return {
         "ms": wall,
         "cpu_ms": cpu,
-        "samples_per_s": 1e3 * case.config.batch_size / wall,
         "flops": costs.flops,
-        "unknown_trips": costs.unknown_trips,
-        "matmul_gflops": product_flops / float(times["matmul"][0]) / 1e6,
         "share_of_floor": float(floor[0]) / wall,
         "share_of_floor_cpu": float(floor[1]) / max(cpu, 1e-9),
         "temporary_mb": temporary_mb(program),
@@ -280,15 +182,130 @@ def step_numbers(case: Case, repeats: int) -> dict[str, Any]:
         "compile_cpu_s": compile_s,
         "tokens": model.runtime.token_capacity if model.tokens == "foreground" else patches,
         "gaussians": len(case.body.template) * model.architecture.decoder.gaussians_per_vertex,
-        "parameters": sum(x.size for x in jax.tree.leaves(case.state.params)),
         "losses": case.metrics,
         "dtype": model.runtime.dtype,
-        "repeats": repeats,
-        "load_average": load,
         "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
     }
 
+
+# Many chips ----------------------------------------------------------------------------------------------------------
+
+VARIANTS = {
+    "kept": {},
+    "recomputed": {"scan": True, "remat": "full"},
+    "foreground": {"tokens": "foreground"},
+    "foreground, recomputed": {"tokens": "foreground", "scan": True, "remat": "full"},
+}
+"""What the backward pass finds of the blocks, and which patches become tokens."""
+FOREGROUND_SHARE = 0.22
+"""Room for foreground tokens: a person by the published protocol touches a fifth (docs/performance.md)."""
+XLA_TOKENS = 8192
+PEAKS = {"TPU v5e: 197 TFLOP/s, 200 GB/s to other chips": (197, 200), "H100: 989 TFLOP/s, 50 GB/s beyond 8": (989, 50)}
+"""TFLOP/s and GB/s of data sheets."""
+
+
+@entry
+def training_cost(
+    run: Run,
+    preset: str = "published",
+    chips: int = 256,
+    fsdp: int | None = None,
+    sizes: tuple[int, ...] = (256, 512),
+    views: int = 4,
+    targets: int = 4,
+    variants: tuple[str, ...] = ("kept", "recomputed", "foreground"),
+) -> None:
+    """What a step of training costs on a mesh of many chips, one subject each, counted from the traced program.
+
+    Counts what one chip does in one step, without the chips and without running anything: operations and what it sends, from the
+    step as it is written (XLA removes next to nothing of either). A minute each. Loss networks have made-up weights. The last
+    columns are these counts over numbers of data sheets.
+
+    Options:
+    fsdp: chips that share one copy of the state; all if not given
+    sizes: of photos and targets, pixels
+    variants: of "kept", "recomputed", "foreground", "foreground, recomputed"
+    """
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={chips}"
+    jax.config.update("jax_platforms", "cpu")  # virtual devices to count for
+
+    def measure(size: int, variant: str) -> dict[str, Any]:
+        mesh = sharding.training_mesh(fsdp, jax.devices())
+        return step_cost(as_variant(settings(preset, size, views, targets, mesh.size), variant), mesh)
+
+    cases = {f"{preset} {size} {v}": functools.partial(measure, size, v) for size in sizes for v in variants}
+    rows, table = run.rows(cases, {"chips": chips, "fsdp": fsdp, "views": views, "targets": targets}), []
+    for what, row in rows.items():
+        sent = sum(row["sent_bytes"].values())
+        cells = [f"{row['flops'] / 1e12:.2f}", f"{row['convolution_flops'] / row['flops']:.0%}"]
+        cells += [sum(row["messages"].values()), f"{sent / 1e6:.0f}", f"{row['state_bytes'] / row['chips'] / 1e6:.1f}"]
+        for flops, bandwidth in PEAKS.values():
+            cells.append(f"{1e-9 * row['flops'] / flops:.1f}; {1e-6 * sent / bandwidth:.1f}")
+        table.append([what, *cells])
+    header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent", "state, MB"]
+    run.show(markdown_table([*header, *(f"{name}: ms; sending" for name in PEAKS)], table), rows)
+
+
+def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
+    """Of one step of a chip."""
+    body = gaussian_body(load_body(), config.model)
+    shapes = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+    state, networks = jax.eval_shape(lambda: init_state(config)), jax.eval_shape(lambda: random_networks(config))
+    batch = abstract_batch(config, len(body.parents), body.shape_directions.shape[-1])
+    placed = lambda tree, shardings: jax.tree.map(
+        lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, shardings
+    )
+    everywhere = lambda tree: placed(tree, jax.tree.map(lambda _: sharding.replicated(mesh), tree))
+    state = placed(state, sharding.state_shardings(state, mesh))
+    batch = placed(batch, jax.tree.map(lambda _: sharding.batch_sharding(mesh), batch))
+    step = jax.jit(update, static_argnames=("config", "mesh"), donate_argnames="state")
+    given = state, batch, everywhere(shapes(body)), everywhere(networks), seed_numbers(config.seed)
+    costs = costs_of(step.trace(*given, config=config, mesh=mesh))
+    return {
+        "chips": mesh.size,
+        "state_bytes": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state)),
+        "flops": costs.flops,
+        "convolution_flops": costs.convolutions,
+        "unknown_trips": costs.unknown_trips,
+        "messages": dict(costs.messages),
+        "sent_bytes": dict(costs.sent),
+    }
+
+
+def abstract_batch(config: Any, joints: int, betas: int) -> Any:
+    """Shapes of an `Example` with a leading axis of `config.batch_size` subjects."""
+
+    def views(count: int, size: int) -> SubjectViews:
+        camera = lambda K, pose: Camera(K, pose, size, size)
+        return SubjectViews(
+            images=jnp.zeros((count, size, size, 3)),
+            masks=jnp.zeros((count, size, size)),
+            cameras=jax.vmap(camera)(jnp.zeros((count, 3, 3)), jnp.zeros((count, 4, 4))),
+            rotations=jnp.zeros((count, joints, 3)),
+            translations=jnp.zeros((count, 3)),
+            betas=jnp.zeros(betas),
+        )
+
+    def example(_: Any) -> Example:
+        inputs = views(config.views.input_counts[0], config.model.conventions.image_size)
+        return Example(inputs, views(config.views.target_count, config.target_size))
+
+    return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
+
+
+def as_variant(config: Any, variant: str) -> Any:
+    """The settings of a stage with one of `VARIANTS`."""
+    fields: dict[str, Any] = dict(VARIANTS[variant])
+    side = config.model.conventions.image_size // config.model.architecture.encoder.patch_size
+    tokens = config.views.input_counts[0] * side**2
+    if fields.get("tokens") == "foreground":
+        tokens = fields["token_capacity"] = int(FOREGROUND_SHARE * tokens)
+    # what "auto" would choose there: it asks for the devices at hand
+    fields["attention"] = "xla" if tokens < XLA_TOKENS else "chunked"
+    return dataclasses.replace(with_model(config, **fields), microbatch_size=1)
+
+
+# The curve of a run --------------------------------------------------------------------------------------------------
 
 SMOOTHING = 20
 """Log lines that a point of the smooth curves averages, at most a quarter of all."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import generator as check_people
-from experiments.generator_poses import people_sheets
+from experiments.generator import people_sheets
 from experiments.harness import call
 from humangs_jax.people import cameras
 from humangs_jax.people.subject import DEMO, make_subject

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.generator_poses import OverlapMeter, winding_numbers
+from experiments.generator import OverlapMeter, winding_numbers
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
 from humangs_jax.people import anatomy as kin
