@@ -299,25 +299,24 @@ def pareto(rows: Sequence[dict[str, Any]], time: str) -> list[dict[str, Any]]:
 
 
 def plot(path: Path, result: dict[str, Any]) -> None:
-    """Time relative to exact against PSNR, forward and with gradients, with the front."""
+    """Time relative to exact against PSNR: a line for each knob, the presets, and the front of all settings."""
     exact, *others = result["settings"]
-    rows = [exact | {"knob": "preset"} | dict.fromkeys(DIRECTIONS, 1.0)]
+    rows = [exact | {"knob": "preset", "forward": 1.0}]
     rows += [row for row in others if row["knob"] not in SCHEDULE and row["label"] != "inria"]
-    knobs = list(dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset"))
-    with figure(path, 2, (13, 6)) as axes:
-        for axis, time in zip(axes, DIRECTIONS, strict=True):
-            steps = zip(*((r[time], r["psnr"]) for r in pareto(rows, time)), strict=True)
-            axis.step(*steps, where="post", color="0.8", lw=2.5)
-            for i, knob in enumerate(knobs):
-                points = [(row[time], row["psnr"]) for row in rows if row["knob"] == knob]
-                style = "s" if knob == "combined" else "o-"
-                axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.8, color=f"C{i}", label=knob)
-            for row in (row for row in rows if row["knob"] == "preset"):
-                axis.plot(row[time], row["psnr"], "*", ms=14, color="black", zorder=3)
-                axis.annotate(row["label"], (row[time], row["psnr"]), (8, 4), textcoords="offset points", weight="bold")
-            axis.set(xlabel=f"{time.replace('_', ' + ')}: CPU time relative to exact", xlim=(None, 1.1))
-        axes[0].set_ylabel("PSNR to the exact image, dB")
-        axes[1].legend(fontsize=8, loc="upper left")
+    with figure(path, 1, (8, 4.4)) as axis:
+        steps = zip(*((row["forward"], row["psnr"]) for row in pareto(rows, "forward")), strict=True)
+        axis.step(*steps, where="post", color="0.8", lw=3, label="best of all settings")
+        for i, knob in enumerate(dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")):
+            points = [(row["forward"], row["psnr"]) for row in rows if row["knob"] == knob]
+            style = "s" if knob == "combined" else "o-"
+            axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.9, color=f"C{i}", label=knob)
+        for row in (row for row in rows if row["knob"] == "preset"):
+            point = row["forward"], row["psnr"]
+            axis.plot(*point, "*", ms=13, color="black", zorder=3)
+            axis.annotate(row["label"], point, (-8, 6), textcoords="offset points", weight="bold", ha="right")
+        axis.set(xlabel="CPU time of an image relative to exact", ylabel="PSNR to the exact image, dB")
+        axis.set_title(f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels", fontsize=9)
+        axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 # Finite differences --------------------------------------------------------------------------------------------------
