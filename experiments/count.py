@@ -1,7 +1,10 @@
 """The size and shape of the project, counted from its files."""
 
 import ast
+import os
+import re
 import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,11 @@ from experiments.results import REPOSITORY, markdown_table
 PACKAGE = "humangs_jax"
 LONG = 500
 """Lines from which on a module is long."""
+GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
+"""Pages that scripts write."""
+TERMS = "rounds of the learned|on the person(?!')|fog|painted body|yardstick|unseen poses|new views|psnr_mask|psnr_foreground"
+DIALECT = re.compile(rf"\b({TERMS}|colour\w*)\b")
+"""Words that the field does not use."""
 
 
 @entry
@@ -61,6 +69,17 @@ def measure(root: Path) -> dict[str, Any]:
         found[f"experiments/{folder}: lines"] = lines(of(f"experiments/{folder}/"))
     pages = [name for name in known if name == "README.md" or (name.startswith("docs/") and name.endswith(".md"))]
     found |= {"docs: pages": len(pages), "docs: words": sum(len((root / name).read_text().split()) for name in pages)}
+    by_hand = {name: written((root / name).read_text()) for name in pages if not name.startswith(GENERATED)}
+    found["docs: words by hand, without code and generated tables"] = sum(
+        len(text.split()) for text in by_hand.values()
+    )
+    found["docs: words of README"] = len((root / "README.md").read_text().split())
+    found["docs: tables on pages written by hand"] = sum(text.count("| --- ") > 0 for text in by_hand.values())
+    found["docs: terms of another dialect"] = [
+        f"{name}: {term}" for name, text in by_hand.items() for term in sorted(set(DIALECT.findall(text)))
+    ]
+    found |= helps(root)
+    found["public functions with arguments, results, errors and an example in the docstring"] = documented(root)
     results = [name for name in known if name.startswith("docs/results/")]
     found["docs/results: lines"] = sum((root / name).read_text().count("\n") for name in results)
     for kind, private in (("public", False), ("private", True)):
@@ -79,6 +98,44 @@ def measure(root: Path) -> dict[str, Any]:
     found["circles of imports"] = circles(always)
     found["circles with imports inside of functions"] = circles(anywhere)
     return found
+
+
+def written(text: str) -> str:
+    """A page without what scripts write into it, and without code."""
+    text = re.sub(r"<!-- table: .*?<!-- end -->", "", text, flags=re.DOTALL)
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def helps(root: Path) -> dict[str, Any]:
+    """Of the command line: lines of all help texts at 80 columns, and lines that are examples."""
+    from humangs_jax.cli import COMMANDS
+
+    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1", "TERM": "dumb", "PYTHONPATH": str(root)}
+    lines: list[str] = []
+    for name in COMMANDS:
+        command = [sys.executable, "-m", "humangs_jax.cli", name, "--help"]
+        lines += subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True).stdout.splitlines()
+    examples = sum(line.startswith("  humangs ") for line in lines)
+    return {"command line: lines of help": len(lines), "command line: examples": examples}
+
+
+def documented(root: Path) -> str:
+    """Public functions whose docstring has a section for all that they take, return and raise, and an example."""
+    complete = every = 0
+    tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
+    for node in (node for node in tree.body if isinstance(node, ast.ImportFrom)):
+        place = root / PACKAGE / str(node.module).replace(".", "/")
+        file = place.with_suffix(".py") if place.with_suffix(".py").is_file() else place / "__init__.py"
+        names = {each.name for each in node.names}
+        for function in ast.parse(file.read_text()).body:
+            if isinstance(function, ast.FunctionDef) and function.name in names:
+                text, taken = ast.get_docstring(function) or "", function.args
+                wanted = ["Args:"] * bool(taken.args or taken.kwonlyargs or taken.kwarg) + ["Example:"]
+                returned = function.returns
+                wanted += ["Returns:"] * (returned is not None and ast.unparse(returned) != "None")
+                every += 1
+                complete += all(f"\n{section}\n" in text for section in wanted)
+    return f"{complete} of {every}"
 
 
 def functions(texts: Iterable[str]) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
