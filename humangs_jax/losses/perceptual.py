@@ -237,6 +237,12 @@ class Lpips:
     net: str = static_field()
 
 
+def _scaled(image: Array) -> Array:
+    """Colors in [0, 1] as the backbones of LPIPS expect them."""
+    shift, scale = (jnp.asarray(x, image.dtype) for x in (SHIFT, SCALE))
+    return (2 * image - 1 - shift) / scale
+
+
 def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
     return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
 
@@ -246,9 +252,8 @@ def lpips_distances(
 ) -> Float[Array, " _"]:
     """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
     images = at_least_float32((predicted, target))
-    shift, scale = (jnp.asarray(x, images[0].dtype) for x in (SHIFT, SCALE))
     slices = BACKBONES[weights.net]
-    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale, size) for image in images]
+    maps = [feature_maps(weights.backbone, slices, _scaled(image), size) for image in images]
     distances = []
     for head, (x, own), (y, _) in zip(weights.heads, *maps, strict=True):
         x, y = at_least_float32((x, y))
@@ -269,6 +274,21 @@ def lpips(
     squeeze).
     """
     return jnp.sum(lpips_distances(weights, predicted, target, size))
+
+
+def vgg16_loss(weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
+    """Mean absolute difference of the features of VGG-16, relative to the mean of the target's, averaged over five depths.
+
+    weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of the original VGG-19, this one
+    works with those of the extra `lpips`, and where LPIPS compares directions of features, it compares their sizes, too. No
+    gradient flows into the target. Raises: ValueError for images under 16 pixels a side, and for another network.
+    """
+    if weights.net != "vgg":
+        raise ValueError(f"vgg16_loss: expected LPIPS vgg, got {weights.net}")
+    images = at_least_float32((predicted, jax.lax.stop_gradient(target)))
+    maps = [[x for x, _ in feature_maps(weights.backbone, VGG16, _scaled(image))] for image in images]
+    pairs = map(at_least_float32, zip(*maps, strict=True))
+    return jnp.mean(jnp.stack([jnp.mean(absolute(x - y)) / (jnp.mean(y) + EPSILON) for x, y in pairs]))
 
 
 MEAN_COLOR = (123.68, 116.779, 103.939)

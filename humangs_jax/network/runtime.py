@@ -75,14 +75,14 @@ class Runtime:
         measured=EVALUATION,
     )
     """Photos are cut to the square around the person's mask before they are brought to that size."""
-    displacement: bool = knob(
-        False,
-        cost="half a second; PSNR where the body is right already",
-        gain="bodies that are a centimetre off: boundaries, hems",
+    displacement: bool | None = knob(
+        None,
+        cost="half a second where the body does not fit the masks, else 0.1 s",
+        gain="boundaries and hems of bodies that are a centimetre off",
         measured="benchmarks/quality.md",
     )
-    """The body is moved to the edges of the masks first (`data.displacement`); for weights that
-    look at the pixels of the "person"."""
+    """The body is moved to the edges of the masks first (`data.displacement`), for weights that look at the pixels of the
+    "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
 

@@ -22,6 +22,9 @@ MEASURED = "refinement.md"
 ITERATIONS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
 
+HEAD_STEPS = 500
+"""As many as 4 s allow on two cores."""
+
 
 @configuration
 class LearningRates:
@@ -55,6 +58,11 @@ class RefineConfig:
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
     """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit. It becomes a number of steps
     before the first step, by the time that a few take; that number, `Refinement.planned`, repeats the run exactly."""
+    head_steps: RefineSteps = knob(
+        HEAD_STEPS, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
+    )
+    """Steps on the head alone afterwards, where photos have 512 pixels or more, `seconds` is None or `steps` 0; 0: none. They
+    move the Gaussians of the head by crops of the photos around it, and let nothing grow beyond the masks (see `head.py`)."""
     image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
     structural: Weight = 0.2
@@ -86,7 +94,7 @@ class RefineConfig:
         """Raises ValueError for settings that do not fit together, naming them."""
         if self.steps is None and self.seconds is None:
             raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")
-        if self.iterations == self.steps == 0:
-            raise ValueError("RefineConfig: iterations 0, steps 0: expected one of them above 0")
+        if self.iterations == self.steps == self.head_steps == 0:
+            raise ValueError("RefineConfig: iterations 0, steps 0, head_steps 0: expected one of them above 0")
         if not self.held_out < 1:
             raise ValueError(f"RefineConfig.held_out {self.held_out:g}: expected less than 1")

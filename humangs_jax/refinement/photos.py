@@ -58,29 +58,39 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
     capture = usable_views(capture)
     if image_size is not None and max(capture.images.shape[1:3]) > image_size:
         capture = capture.resized(image_size)
-    images, cameras, masks = capture.images, capture.cameras, capture.masks
-    assert masks is not None
-    height, width = masks.shape[1:]
-    boxes = [_bounds(mask) for mask in masks]
-    rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
-    corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
-
-    def crop(arrays: Float[np.ndarray, "v h w *c"]) -> Float[Array, "v rows columns *c"]:
-        windows = [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
-        return jnp.asarray(np.stack(windows), jnp.float32)
-
-    shift = np.zeros((len(images), 3, 3), np.float32)
-    shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
+    assert capture.masks is not None
+    boxes = [_bounds(mask) for mask in capture.masks]
+    images, masks, cameras = windows(capture.images, capture.masks, capture.cameras, boxes)
     frames = np.asarray(capture.frames)
     views = SubjectViews(
-        images=crop(images),
-        masks=crop(masks),
-        cameras=replace(cameras, K=cameras.K - shift, width=columns, height=rows),
+        images=images,
+        masks=masks,
+        cameras=cameras,
         rotations=jnp.asarray(capture.poses.rotations)[frames],
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
     )
     return upright(views, capture.body)
+
+
+def windows(
+    images: Float[Array | np.ndarray, "v h w 3"],
+    masks: Float[Array | np.ndarray, "v h w"],
+    cameras: Camera,
+    boxes: Sequence[Sequence[Sequence[int]]],
+) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
+    """Windows of one size around a box in each view, ((top, bottom), (left, right)), and the cameras that see them."""
+    height, width = masks.shape[1:]
+    rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
+    corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
+
+    def crop(arrays: Float[Array | np.ndarray, "v h w *c"]) -> Float[Array, "v rows columns *c"]:
+        cut = [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
+        return jnp.asarray(np.stack(cut), jnp.float32)
+
+    shift = np.zeros((len(images), 3, 3), np.float32)
+    shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
+    return crop(images), crop(masks), replace(cameras, K=cameras.K - shift, width=columns, height=rows)
 
 
 def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
+from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Int
 from humangs_jax.core.checks import checked_arguments
@@ -17,6 +18,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.usable_views import unusable_views
 from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.head import head_crops, sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of
 from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.refinement.search import Clock, comparison, prepare, search
@@ -47,6 +49,8 @@ class Refinement:
     """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None: it was cut short."""
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
+    head_steps: int = 0
+    """Of the optimizer, on the head alone."""
 
     def summary(self) -> str:
         """One line."""
@@ -54,9 +58,10 @@ class Refinement:
         verdict = gain if self.kept else "no improvement: the avatar is unchanged"
         if self.left_out:
             verdict += f"; without {', '.join(self.left_out)}, which contradicts the others"
+        head = f", {self.head_steps} on the head," if self.head_steps else ""
         ended = ", interrupted" if self.interrupted else ""
         took = (
-            f"{self.iterations} iterations and {self.steps} steps in {self.seconds:.1f} s "
+            f"{self.iterations} iterations and {self.steps} steps{head} in {self.seconds:.1f} s "
             f"(compiled in {self.compile_seconds:.1f} s)"
         )
         again = f" (the same again: {self.planned}steps)" if self.planned else ""
@@ -126,24 +131,36 @@ def refine_with_report(
                 watch(avatar_of(found.state.parameters, task.avatar))
     except KeyboardInterrupt:
         interrupted = True
-    seconds = clock.stopped()
     fitted = [task.photos[i] for i in best.used]
     before = jax.tree.map(lambda x: x[best.used], each).together()
     after = comparison(task, best.state.parameters, fitted, best.state.splat).together()
     kept = bool(after.loss < before.loss)
     after = after if kept else before
+    result, crops = avatar_of(best.state.parameters, task.avatar) if kept else avatar, None
+    unlimited = config.seconds is None or config.steps == 0
+    if config.head_steps and unlimited and not interrupted and shows_heads(capture, config):
+        try:
+            with clock.compiling():
+                begin = with_low_pass_of(result, views)
+                crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config.image_size)
+            if crops is not None:
+                result = sharpened(begin, best.state.trust, crops, config, clock)
+        except KeyboardInterrupt:
+            crops, interrupted = None, True
+    seconds = clock.stopped()
     return Refinement(
-        avatar_of(best.state.parameters, task.avatar) if kept else avatar,
+        result,
         best.iterations,
         clock.done,
         seconds,
         clock.compile_seconds,
         loss=(float(before.loss), float(after.loss)),
         psnr=(float(before.psnr), float(after.psnr)),
-        kept=kept,
+        kept=kept or crops is not None,
         interrupted=interrupted,
         planned=None if interrupted or clock.late else clock.planned,
         left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
+        head_steps=0 if crops is None else config.head_steps,
     )
 
 
@@ -159,6 +176,9 @@ def _check(avatar: Avatar, capture: Capture) -> None:
 
 def _without(capture: Capture, used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
     """Names of the usable views that are not among these."""
+    return tuple(capture.names[view] for i, view in enumerate(_usable(capture)) if i not in used)
+
+
+def _usable(capture: Capture) -> Int[np.ndarray, " n"]:
     unusable = unusable_views(capture)
-    names = [name for i, name in enumerate(capture.names) if i not in unusable]
-    return tuple(name for i, name in enumerate(names) if i not in used)
+    return np.asarray([i for i in range(capture.view_count) if i not in unusable])

@@ -59,6 +59,7 @@ BUFFERS = ("max_pairs", "max_rows")
 HOST_SETTINGS = {
     "iterations": 1,
     "steps": 1,
+    "head_steps": 1,
     "seconds": None,
     "image_size": None,
     "held_out": 0.0,
@@ -120,8 +121,12 @@ class Clock:
     def tick(self, shown: float) -> None:
         """A step is done. shown: where the bar is, in [0, 1]."""
         self.done += 1
-        self.bar.update(int(100 * shown) - self.bar.n)
+        self.show(shown)
         self.late = self.late or (self.seconds is not None and self.elapsed() > OVERRUN * self.seconds)
+
+    def show(self, shown: float) -> None:
+        """Move the bar."""
+        self.bar.update(int(100 * shown) - self.bar.n)
 
     def stopped(self) -> float:
         """`elapsed`, at the end of the run: closes the bar."""

@@ -69,8 +69,13 @@ def init_state(parameters: Parameters, found: Comparison, config: RefineConfig, 
     """The state before the first step. found: comparison of the parameters with the photos; Gaussians that no photo shows get
     no trust.
     """
+    return started(parameters, _trust(found.visibility, config), config, splat)
+
+
+def started(parameters: Parameters, trust: Float[Array, " g"], config: RefineConfig, splat: SplatConfig) -> RefineState:
+    """`init_state`, with a trust that is known."""
     moments = OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
-    return RefineState(parameters, parameters, _trust(found.visibility, config), moments, found.overflow, splat)
+    return RefineState(parameters, parameters, trust, moments, jnp.zeros((), jnp.int32), splat)
 
 
 @compiled

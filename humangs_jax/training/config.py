@@ -236,7 +236,7 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
 
     Structural dissimilarity takes their place: its weight becomes at least that of `LossConfig()`.
     """
-    needing = ("perceptual", "lpips")
+    needing = ("perceptual", "vgg16", "lpips")
     missing = [name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None]
     if not missing:
         return config

@@ -407,7 +407,9 @@ def test_masks_displace_the_body_if_the_network_looks_at_the_person_alone(body, 
     moved = lambda photos, config: _views(photos, gaussian_body(body, config), config)[0].displacement
     assert moved(photos, on).shape == body.template.shape
     assert moved(dataclasses.replace(photos, masks=None), on) is None  # then the result is what it was, bit for bit
-    assert moved(photos, on.with_conventions(pixels="all")) is None and moved(photos, config) is None
+    off = config.with_runtime(displacement=False)
+    assert moved(photos, on.with_conventions(pixels="all")) is None and moved(photos, off) is None
+    assert not moved(photos, config).any()  # no body sticks out of masks that are full
 
 
 @pytest.mark.slow

@@ -96,6 +96,16 @@ def test_the_inset_is_kept(body, dressed):
     assert np.median(near - deep) == pytest.approx(0.004, abs=FOUND / 2)
 
 
+def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
+    """Clothes put no body outside of a mask; a body that is too heavy lies there."""
+    capture, _ = dressed
+    assert not displacement(body, capture, always=False).any()
+    heavy = capture.betas + 3.0 * np.asarray([name == "weight" for name in body.shape_names])
+    wrong = dataclasses.replace(capture, betas=heavy)
+    inwards = along_normals(body, wrong, displacement(body, wrong, always=False))[free(body) > 0.99]
+    assert np.percentile(inwards, 10) < -COAT / 2
+
+
 def test_joints_stay(body, dressed):
     capture, _ = dressed
     blank = jnp.zeros((1, 8, 8, 3))

@@ -217,7 +217,7 @@ def stand_ins(variant):
         "detection.blazepose.available": lambda: False,
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: ((), (SimpleNamespace(problem=None, inside=1.0),) * capture.view_count),
-        "apps.check._posed_frames": lambda capture: {0: np.zeros((4, 3))},
+        "apps.check._posed_frames": lambda capture, *_: {0: np.zeros((4, 3))},
         "apps.demo.load_weights": lambda *_: (None, tiny()),
         "apps.demo.reconstruct": avatar,
         "apps.demo.animate": lambda avatar, _: avatar.gaussians,

@@ -27,6 +27,7 @@ from humangs_jax.losses.perceptual import (
     lpips_distances,
     perceptual_errors,
     perceptual_loss,
+    vgg16_loss,
 )
 
 DATA = Path(__file__).parent / "data"
@@ -157,6 +158,30 @@ def test_the_golden_numbers():
     np.testing.assert_allclose(losses.mean(), golden["total"], rtol=FLOAT32)
     alone = jax.jit(perceptual_loss)(vgg, images[0][1], images[1][1])
     np.testing.assert_allclose(losses[1], alone, rtol=FLOAT32)
+
+
+def test_the_loss_of_vgg16_against_its_definition():
+    """Convolutions and pools by numpy, in float64."""
+    predicted, target = image_pair(16, 19)
+    shift, scale = np.asarray([-0.030, -0.088, -0.188]), np.asarray([0.458, 0.448, 0.450])
+    ends, features = ("2", "7", "14", "21", "28"), []
+    for image in (predicted, target):
+        x, found = (2 * image - 1 - shift) / scale, []
+        for name, (kernel, bias) in convolutions_of("vgg", np.float64).items():
+            windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, ((1, 1), (1, 1), (0, 0))), (3, 3), axis=(0, 1))
+            x = np.maximum(np.tensordot(windows, kernel, ((3, 4, 2), (0, 1, 2))) + bias, 0)
+            if name in ends:
+                found.append(x)
+                rows, columns = x.shape[0] // 2, x.shape[1] // 2  # 0 after the last one
+                x = x[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, x.shape[2]).max(axis=(1, 3), initial=0)
+        features.append(found)
+    expected = np.mean([np.abs(x - y).mean() / y.mean() for x, y in zip(*features, strict=True)])
+    images = [jnp.asarray(x, jnp.float32) for x in (predicted, target)]
+    loss = jax.jit(vgg16_loss)
+    assert float(loss(made_up("vgg"), *images)) == pytest.approx(expected, rel=bound(FLOAT32))
+    assert float(loss(made_up("vgg"), images[0], images[0])) == 0
+    with pytest.raises(ValueError, match="expected LPIPS vgg, got alex"):
+        vgg16_loss(made_up("alex"), *images)
 
 
 @pytest.mark.slow

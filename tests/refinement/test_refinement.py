@@ -182,7 +182,7 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
     ("settings", "named"),
     [
         ({"steps": None, "seconds": None}, "steps, seconds"),
-        ({"iterations": 0, "steps": 0}, "iterations 0, steps 0"),
+        ({"iterations": 0, "steps": 0, "head_steps": 0}, "iterations 0, steps 0"),
         ({"iterations": -1}, "iterations -1"),
         ({"seconds": 0.0}, "seconds"),
         ({"visible": 0.0}, "visible"),

@@ -180,11 +180,13 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
         assert np.linalg.norm(a - b) <= FLOAT64 * np.linalg.norm(b) + 1e-12
 
 
-WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25))
+WITH_NETWORKS = dataclasses.replace(
+    CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25, vgg16=0.1)
+)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "title"), [("perceptual", "VGG-19"), ("lpips", "LPIPS")])
+@pytest.mark.parametrize(("name", "title"), [("perceptual", "VGG-19"), ("lpips", "LPIPS"), ("vgg16", "LPIPS vgg")])
 def test_a_loss_without_its_network_is_an_error_not_a_number(body, source, variables, name, title):
     loss = dataclasses.replace(CONFIG.loss, **{name: 1.0})
     with pytest.raises(ValueError, match=f"loss.{name} is not 0, but there is no {title}"):
@@ -203,11 +205,11 @@ def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype)
     config = dataclasses.replace(WITH_NETWORKS, model=CONFIG.model.with_runtime(dtype=dtype))
     state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
     weights = dataclasses.asdict(config.loss)
-    names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips")
+    names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips", "vgg16")
     assert float(metrics["loss"]) == pytest.approx(
         sum(weights[x] * float(metrics[x]) for x in names), rel=bound(FLOAT32)
     )
-    assert float(metrics["perceptual"]) > 0 and float(metrics["lpips"]) > 0
+    assert all(float(metrics[name]) > 0 for name in ("perceptual", "lpips", "vgg16"))
     assert int(state.opt_state.skipped) == int(state.opt_state.nonfinite) == 0
     first = float(metrics["perceptual"])
     for _ in range(20):

@@ -1,0 +1,177 @@
+"""Detail where people look: steps on the head alone, in crops of the photos around it.
+
+Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks, and alpha beyond a mask costs
+more than in steps on the whole person, so that no coverage grows at the silhouette.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.animate import with_low_pass_of
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import posed
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import project
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.objective import Image, avatar_of, compiled, drawn_photo, image_loss, parameters_of, pulled
+from humangs_jax.refinement.photos import MARGIN, Photo, crop_to_person, photos_of, windows
+from humangs_jax.refinement.search import BUFFERS, HOST_SETTINGS, Clock, planned
+from humangs_jax.refinement.steps import RefineState, started, update
+from humangs_jax.rendering.splat_config import SplatConfig
+
+JOINTS = ("head", "jaw", "eye")
+"""Parts of the names of the head's joints."""
+LEAST_SIDE = 512
+"""Pixels of the photos' longer side from which heads show more than the iterations leave."""
+LARGEST_HEAD = 112
+"""Pixels: photos are reduced until heads are no larger."""
+SIDES = 32
+"""Sides of the crops are multiples of it, pixels."""
+SIMILAR = 1.25
+"""Photos are reduced anew where heads are smaller or larger by more."""
+EXCESS = 1.0
+"""Weight of alpha beyond the mask."""
+OPAQUE = 0.1
+"""Gaussians of the head above this opacity are to be in the crops."""
+OUTLIERS = 1.0
+"""Percent of them, at each side, that need not be."""
+FAR = 1e4
+"""Pixels: bound of places outside of photos."""
+PARTS = 10
+"""Of a run; between them it can be interrupted."""
+
+
+class Crops(NamedTuple):
+    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show. views: the crops."""
+
+    moved: Bool[np.ndarray, " g"]
+    drawn: Int[np.ndarray, " d"]
+    views: SubjectViews
+
+
+def shows_heads(capture: Capture, config: RefineConfig) -> bool:
+    """Whether photos are large enough for steps on the head."""
+    longest = max(capture.images.shape[1:3])
+    return min(longest, config.image_size or longest) >= LEAST_SIDE
+
+
+def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock) -> Avatar:
+    """The avatar after `config.head_steps` steps on its head. trust: see `RefineState`. avatar: with the low-pass of photos."""
+    photos, count = photos_of(crops.views), config.head_steps
+    settings = dataclasses.replace(config, **HOST_SETTINGS)
+    with clock.compiling():
+        drawn = with_low_pass_of(avatar.select(crops.drawn), crops.views)
+        parameters = parameters_of(drawn.gaussians, len(photos.index), len(drawn.parents))
+        share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
+        splat = planned(drawn, crops.views)
+        splat = dataclasses.replace(splat, visibility=False, **{x: _power(getattr(splat, x)) for x in BUFFERS})
+        state = started(parameters, share, settings, splat)
+        state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(()))
+        state = _advanced(state, 0, photos, drawn, settings, clock)
+    for part in range(1, PARTS + 1):
+        state = _advanced(state, part * count // PARTS, photos, drawn, settings, clock)
+        clock.show(part / PARTS)
+    own, new = avatar.gaussians, avatar_of(state.parameters, drawn).gaussians
+    rows = np.flatnonzero(crops.moved[crops.drawn])
+
+    def put(before: Array, after: Array) -> Array:
+        merged = np.array(before)
+        merged[crops.drawn[rows]] = np.asarray(after)[rows]
+        return jnp.asarray(merged)
+
+    return replace(avatar, gaussians=jax.tree.map(put, own, new))
+
+
+def _advanced(
+    state: RefineState, stop: int, photos: Photo, avatar: Avatar, settings: RefineConfig, clock: Clock
+) -> RefineState:
+    """The state at step `stop`, with buffers in which all fits."""
+
+    def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
+        begin = replace(state, splat=splat, overflow=jnp.zeros((), jnp.int32))
+        new = _steps(begin, photos, avatar, jnp.asarray(stop), settings)
+        return new, new.overflow
+
+    return clock.with_room(advanced, state.splat)
+
+
+@compiled
+def _steps(
+    state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig
+) -> RefineState:
+    """The state at step `stop`, one photo a step, in turns; its overflow is that of all steps."""
+
+    def one(state: RefineState) -> RefineState:
+        photo = jax.tree.map(lambda x: x[state.done % len(photos.index)], photos)
+        image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat, config.poses)
+        gradient, _ = pulled(pull_back, jax.grad(head_loss)(image, photo, config))
+        return update(replace(state, overflow=state.overflow + rendering.overflow), gradient, config)
+
+    return jax.lax.while_loop(lambda state: state.done < stop, one, state)
+
+
+def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
+    """`image_loss` of the colors inside the mask, and what alpha exceeds the mask by."""
+    rgb = photo.image + photo.mask[..., None] * (image[0] - photo.image)
+    return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(jnp.maximum(image[1] - photo.mask, 0))
+
+
+def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crops | None:
+    """Crops of the photos around the head; None if the body has none or no photo shows it. capture: of usable views."""
+    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name.lower() for part in JOINTS)]
+    moved = np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
+    sure = moved & (np.asarray(avatar.gaussians.opacities) > OPAQUE)
+    if not sure.any():
+        return None
+    longest = max(capture.images.shape[1:3])
+    size = min(longest, image_size or longest)
+    views = crop_to_person(capture, size)
+    middles, side = _squares(_pixels(avatar, views)[:, sure])
+    wanted = min(longest, round(size * LARGEST_HEAD / side))
+    if not 1 / SIMILAR < wanted / size < SIMILAR:
+        views = crop_to_person(capture, wanted)
+        middles, side = _squares(_pixels(avatar, views)[:, sure])
+    seen = np.flatnonzero(((middles >= 0) & (middles < views.masks.shape[1:])).all(axis=1))
+    if not len(seen):
+        return None
+    half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
+    boxes = [[(int(at) - half, int(at) + half) for at in middles[i]] for i in seen]
+    views = replace(views, rotations=views.rotations[seen], translations=views.translations[seen])
+    images, masks, cameras = windows(
+        np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes
+    )
+    views = replace(views, images=images, masks=masks, cameras=cameras)
+    pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
+    shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
+    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(shown.sum())]), views)
+
+
+def _power(number: float) -> int:
+    """The power of two that is not smaller: few numbers are few programs."""
+    return 1 << max(0, int(number) - 1).bit_length()
+
+
+def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
+    """Where the views show the centres of the Gaussians; those behind a camera: far outside."""
+    found = []
+    for rotations, translation, camera in zip(views.rotations, views.translations, views.cameras, strict=True):
+        pixels, depths = _projected(camera, posed(avatar, BodyPose(rotations, translation)).means)
+        found.append(np.where(np.asarray(depths)[:, None] > 0, pixels, np.inf))
+    return np.stack(found)
+
+
+_projected = jax.jit(project)
+
+
+def _squares(pixels: Float[np.ndarray, "v g 2"]) -> tuple[Float[np.ndarray, "v 2"], int]:
+    """(y, x) of the middles of the squares in which most points lie in each view, and their side, pixels."""
+    low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[..., ::-1]
+    return (low + high) / 2, max(1, int(np.ceil((high - low).max())))
