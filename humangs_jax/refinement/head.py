@@ -151,12 +151,12 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     views = replace(views, images=images, masks=masks, cameras=cameras)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
-    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(shown.sum())]), views)
+    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))]), views)
 
 
-def _power(number: float) -> int:
+def _power(number: int) -> int:
     """The power of two that is not smaller: few numbers are few programs."""
-    return 1 << max(0, int(number) - 1).bit_length()
+    return 1 << max(0, number - 1).bit_length()
 
 
 def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
