@@ -54,8 +54,8 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     are left out. Numbers of views and of foreground tokens are rounded up to few sizes, each with a program of its own.
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
-    another world. Where the body sticks out of the masks, it is displaced to them first (`Runtime.displacement`). For a network with a driver this is the
-    avatar before any correction of a frame.
+    another world. Where the body sticks out of the masks, it is displaced to them first (`Runtime.displacement`). For a network
+    with a driver this is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
