@@ -136,13 +136,17 @@ class Reconstruct:
             if done:
                 tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
             captures = {name: folder for name, folder in list(captures.items())[part::parts] if name not in done}
+        views = settings.views if settings is not None and self.views is None else self.views
+        load = {name: functools.partial(self._photos, folder, views) for name, folder in captures.items()}
+        if not several:  # what is wrong with it is said before the network is read
+            (name, read), *_ = load.items()
+            photos = read()
+            load = {name: lambda: photos}
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         config = config if settings is None else settings.network(config)
         said = {"tokens": self.tokens, "dtype": self.dtype}
         config = config.with_runtime(**{name: value for name, value in said.items() if value != "as_trained"})
-        views = settings.views if settings is not None and self.views is None else self.views
-        load = {name: functools.partial(self._photos, folder, views) for name, folder in captures.items()}
         failed = []
         with stage("reconstructing"):
             made = reconstruct_many(variables, config, load, self.batch)

@@ -1,12 +1,13 @@
 """Variants of a training run against the run itself: the same people, steps and seeds, differences with intervals."""
 
 import dataclasses
+import importlib
 import json
 import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -21,9 +22,6 @@ from humangs_jax.people.subject import seeds_of
 from humangs_jax.training.config import TrainConfig, fitting_losses, read_config
 from humangs_jax.training.loop import train
 from humangs_jax.training.sources import MakeSource, on_the_fly_people
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 BASE = "base"
 CONFIDENCE = 0.95
@@ -71,12 +69,15 @@ class Ablation:
             [*lines, f"{self.missing} runs are missing: the budget was used up"][: len(lines) + bool(self.missing)]
         )
 
-    def plot(self) -> "Figure":
-        """Differences to the base with their intervals; gray where the interval contains 0. Needs matplotlib."""
-        from matplotlib.figure import Figure
+    def plot(self) -> Any:
+        """Differences to the base with their intervals; gray where the interval contains 0.
 
+        Raises: ImportError without matplotlib, which the extra `notebooks` installs.
+        """
         rows = [row for row in self.rows if row.name != BASE][::-1]
-        figure = Figure(figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained")
+        figure = importlib.import_module("matplotlib.figure").Figure(
+            figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained"
+        )
         axis = figure.add_subplot()
         for place, row in enumerate(rows):
             color = "tab:blue" if row.clear else "0.6"
