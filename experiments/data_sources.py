@@ -1,9 +1,8 @@
-"""How fast each data set is read, against what training takes; how long preprocessing takes; whether memory stays flat."""
+"""How fast each data set is read, against what training takes; how long preprocessing takes."""
 
 import functools
 import importlib.util
 import json
-import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -48,11 +47,6 @@ def spent(work: Callable[[], object]) -> dict[str, float]:
     return {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
 
 
-def resident_bytes() -> int:
-    """The resident set of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 def have_h5py() -> bool:
     """Whether DNA-Rendering can be written and read."""
     return importlib.util.find_spec("h5py") is not None
@@ -77,18 +71,17 @@ def enlarge(folder: Path, size: tuple[int, int]) -> None:
         path.write_text("\n".join([head, *rows]) + "\n")
 
 
-def write_set(layout: str, out: Path, real_size: bool) -> tuple[Path, Path]:
-    """A data set and its body file. real_size: of its photos; else they are a fifth (DNA-Rendering: a quarter) as wide."""
+def write_set(layout: str, out: Path) -> tuple[Path, Path]:
+    """A data set with photos of the real size, and its body file."""
     if layout == "thuman":
         folder = made_up.write_thuman(out, made_up.SEEDS[:1])
     elif layout == "dna":
-        enlarged = DNA_ENLARGED if real_size else 1
-        folder = made_up.write_dna(out, frames=3, cameras=4, size=DNA_SIZE, enlarged=enlarged, lens=DNA_LENS)
+        lens = DNA_LENS
+        folder = made_up.write_dna(out, frames=3, cameras=4, size=DNA_SIZE, enlarged=DNA_ENLARGED, lens=lens)
     else:
         width, height = (pixels // SMALLER for pixels in REAL_SIZES[layout])
         folder = made_up.WRITERS[layout](out, frames=3, cameras=4, size=(width, height))
-        if real_size:
-            enlarge(folder, (width * SMALLER, height * SMALLER))
+        enlarge(folder, (width * SMALLER, height * SMALLER))
     return folder, out / "body.npz"
 
 
@@ -127,12 +120,6 @@ def measure_reading(people: Any, samples: int) -> dict[str, float]:
     return {"open_s": opened["cpu_s"]} | speeds
 
 
-def grown_bytes(people: Any, samples: int) -> float:
-    """Growth of the resident set over a number of samples of two views : the mean of the last 20 less that of 20 early ones."""
-    sizes = [resident_bytes() for i, _ in enumerate(examples(people, 1, 1, samples)) if i >= samples // 5]
-    return (sum(sizes[-20:]) - sum(sizes[:20])) / 20
-
-
 def table(result: dict[str, Any]) -> str:
     """Sources, then preprocessing."""
     step = result["train_step_s"]
@@ -140,18 +127,12 @@ def table(result: dict[str, Any]) -> str:
     for name, numbers in result["sources"].items():
         share = numbers["cpu_s_per_sample"] / step
         cells = [significant(numbers["samples_per_s"]), significant(1e3 * numbers["cpu_s_per_sample"])]
-        grown = [
-            f"{numbers[of] / 2**20:+.1f} MiB over {numbers[over]:,.0f}" if numbers.get(over) else ""
-            for of, over in (("grown_bytes", "samples_of_memory"), ("grown_bytes_small", "samples_of_memory_small"))
-        ]
-        rows.append([NAMES[name], *cells, f"{100 * share:.0f} %", *grown])
-    header = ["source", "samples a second", "CPU ms a sample", "share of a training step", "memory"]
-    header.append("memory, smaller photos")
+        rows.append([NAMES[name], *cells, f"{100 * share:.0f} %"])
+    header = ["source", "samples a second", "CPU ms a sample", "share of a training step"]
     made = [[PREPROCESSED[kind], significant(1e3 * n["cpu_s_per_view"])] for kind, n in result["preprocessing"].items()]
     parts = [
         f"A sample is {INPUTS} input and {TARGETS} target views at {SIZE} px, decoded from disk every time; a training step of "
-        f"the preset `small` takes {step:.2g} s and one sample. Memory: growth of the resident set over samples of two views; "
-        f"smaller photos are a fifth as wide (DNA-Rendering: a quarter).",
+        f"the preset `small` takes {step:.2g} s and one sample.",
         markdown_table(header, rows),
         markdown_table(["preprocessing to 512 px", "CPU ms"], made),
     ]
@@ -163,35 +144,29 @@ def data_sources(
     run: Run,
     sources: tuple[str, ...] = tuple(NAMES),
     samples: int = 20,
-    flat: int = 1000,
-    flat_photos: int = 100,
     train_step_s: float = 2.8,
     views: int = 12,
 ) -> None:
-    """How fast each data set is read, against what training takes; how long preprocessing takes; whether memory stays flat.
+    """How fast each data set is read, against what training takes; how long preprocessing takes.
 
     Synthetic people are written in each layout with photos of the real sizes, read through the loader (4 input and 3 target
-    views at 256 pixels a sample, nothing kept in memory), and preprocessed. Memory: growth of the resident set of this process
-    after the first fifth of samples of two views (small: of photos a fifth as wide). CPU seconds count the work of all threads.
-    15 minutes.
+    views at 256 pixels a sample, nothing kept in memory), and preprocessed. CPU seconds count the work of all threads.
 
     Options:
     sources: what is read; DNA-Rendering is left out without h5py
     samples: that are timed
-    flat: samples over which memory is watched
-    flat_photos: the same of large photos
     train_step_s: seconds of a training step (docs/data.md)
     views: of the scan
     """
-    if min(samples, views) < 1 or min(flat, flat_photos) < 50:
-        raise ValueError("--samples and --views must be at least 1, --flat and --flat-photos at least 50")
+    if min(samples, views) < 1:
+        raise ValueError("--samples and --views must be at least 1")
     chosen = [name for name in NAMES if name in sources and (name != "dna" or have_h5py())]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
 
         @functools.cache
-        def written(layout, real_size=True):
-            return write_set(layout, out / f"{layout}_{real_size}", real_size)
+        def written(layout):
+            return write_set(layout, out / layout)
 
         @functools.cache
         def preprocessed():
@@ -202,17 +177,10 @@ def data_sources(
             if name == "scenes":
                 preprocessed()
                 path = out / "thuman_scenes" / "test.json"
-            people, watched = open_people(path, FileBody.load(body)), flat if name == "scenes" else flat_photos
-            row = measure_reading(people, samples) | {"samples_of_memory": watched}
-            row["grown_bytes"] = grown_bytes(people, watched)
-            if name != "scenes":
-                path, body = written(name, False)
-                row["grown_bytes_small"] = grown_bytes(open_people(path, FileBody.load(body)), flat)
-                row["samples_of_memory_small"] = flat
-            return row
+            return measure_reading(open_people(path, FileBody.load(body)), samples)
 
         cases = {"preprocessing": preprocessed} | {name: functools.partial(source, name) for name in chosen}
-        rows = run.rows(cases, {"samples": samples, "flat": flat, "flat_photos": flat_photos, "views": views})
+        rows = run.rows(cases, {"samples": samples, "views": views})
     made = rows.pop("preprocessing")
     result = {"train_step_s": train_step_s, "preprocessing": made, "sources": rows}
     run.show(table(result), result)

@@ -22,7 +22,7 @@ import numpy as np
 from experiments import tradeoff_report
 from experiments.harness import Run, entry
 from experiments.reconstruction import random_variables
-from experiments.results import REPOSITORY, markdown_table, write_json
+from experiments.results import write_json
 from experiments.subjects import (
     TASKS,
     EvaluationSubject,
@@ -36,7 +36,6 @@ from experiments.timing import timed
 from experiments.tradeoff_report import DEFAULT, points
 from humangs_jax.apps.settings import reconstruct_with
 from humangs_jax.avatar.frames import capture_views, draw, splatting_of, without_unseen
-from humangs_jax.avatar.reconstruct import reconstruct_batch
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.core.configuration import config_to_json
@@ -74,7 +73,7 @@ def tradeoff(
 ) -> None:
     """Speed against accuracy of the whole path: some 70 settings, their front, and presets. 50 minutes on one core.
 
-    Tables: tradeoff, tradeoff_presets, tradeoff_naive, tradeoff_growth
+    Tables: tradeoff, tradeoff_presets
 
     Options:
     out: JSON of the points; those that are there are not measured again
@@ -88,14 +87,14 @@ def tradeoff(
     settings = settings_of()
     result = json.loads(out.read_text()) if out.exists() else {}
     if result.get("settings") != settings:
-        result = {"settings": settings, "points": {}, "growth": {}}
+        result = {"settings": settings, "points": {}}
     rows, wanted = result["points"], [p for p in points() if not only or p.knob in only]
     for each in wanted:
         if described(each) != rows.get(each.name, {}).get("what"):
             rows[each.name] = {"what": described(each), "people": []}
     missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
     missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
-    if missing or not result["growth"]:
+    if missing:
         bench = Bench(subjects, people, iterations)
         # all of one person, then the next: times are of the first
         for done, (i, each) in enumerate(bar(missing, desc="points", unit="point")):
@@ -103,39 +102,7 @@ def tradeoff(
                 jax.clear_caches()  # compiled programs hold memory maps, of which Linux gives a process 65,530
             bench.measure(each, i, rows[each.name])
             write_json(out, result)
-        result["growth"] = result["growth"] or bench.growth()
-        write_json(out, result)
     tradeoff_report.show(run, result, image, front)
-
-
-CLOSE, DECIBELS = 0.2, 0.3
-
-
-@entry
-def presets(run: Run, people: Path | None = None) -> int:
-    """Whether the presets still take and gain what docs/results/tradeoff.json says, in one run on this machine.
-
-    Times as shares of the default point's, in turns with it, have to be within 20 % of those of the sweep, and the PSNR of the
-    first person within 0.3 dB. Exit status 1 if one is not. 10 minutes on one core.
-
-    Options:
-    people: folder where rendered people are kept
-    """
-    claimed = json.loads((REPOSITORY / "docs/results/tradeoff.json").read_text())["numbers"]
-    if claimed["settings"] != settings_of():
-        print("the sweep was made with other weights or people: run `tradeoff` again")
-        return 1
-    bench, table = Bench(1, people, iterations=3), []
-    for point in (point for point in points() if point.knob == "preset"):
-        row: dict[str, Any] = {"people": []}
-        bench.measure(point, 0, row)
-        said, names = claimed["points"][point.name], ("PSNR, same pose", "PSNR, novel poses")
-        pairs = [(key, row[key], said[key], abs(row[key] / said[key] - 1) <= CLOSE) for key in ("reconstruct", "frame")]
-        found = [row["people"][0][task]["psnr"] for task in TASKS]
-        pairs += [(n, a, b, abs(a - b) <= DECIBELS) for n, a, b in zip(names, found, said["first_person"], strict=True)]
-        table += [[point.name, n, f"{a:.2f}", f"{b:.2f}", "yes" if ok else "NO"] for n, a, b, ok in pairs]
-    run.show(markdown_table(["preset", "claim", "now", "sweep", "holds"], table, "llrrl"))
-    return int(any(cells[-1] == "NO" for cells in table))
 
 
 def settings_of() -> dict[str, Any]:
@@ -310,10 +277,10 @@ class Bench:
         own, default = np.median(pairs, axis=0)
         return {"frame": 1.0, "frame_ms": float(default)} if point is self.default else {"frame": float(own / default)}
 
-    def frames(self, avatar, size, how, cameras=None):
+    def frames(self, avatar, size, how):
         """Frames without end, in the poses of the held-out views."""
         poses, views = capture_views(avatar, self.person(0).held_out)
-        cameras = views.resized(size, size) if cameras is None else cameras
+        cameras = views.resized(size, size)
         turns = lambda: itertools.cycle(range(len(poses.rotations)))
         pose = lambda i: jax.tree.map(lambda x: x[i], poses)
         renderings = draw(avatar, (pose(i) for i in turns()), (cameras[i] for i in turns()), how=how)
@@ -347,27 +314,3 @@ class Bench:
         with peak_memory() as peak:
             avatar = make()
         return {"reconstruct": float(own / default), "memory_mb": peak[0], "gaussians": len(avatar.gaussians.means)}
-
-    def growth(self) -> dict[str, Any]:
-        """People in a batch over one person, and a large frame with the person in a small box over a frame of the box."""
-        photos = [self.person(i).inputs(4) for i in range(self.subjects)]
-        batch = {}
-        for count in (1, 2, 4):
-            captures = [photos[i % len(photos)] for i in range(count)]
-            run = lambda captures=captures: jax.block_until_ready(
-                reconstruct_batch(self.variables, self.config, captures)
-            )
-            run()
-            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(self.iterations)])
-            batch[str(count)] = float(np.divide(*np.median(pairs, axis=0)))
-        small = self.person(0).held_out.cameras.resized(256, 256)
-        how = self.how(self.default, self.default_avatar)
-        boxes = {}
-        for side in (256, 512, 1024):
-            shift = jnp.zeros((3, 3)).at[:2, 2].set((side - 256) / 2)
-            boxes[side] = self.frames(
-                self.default_avatar, side, how, replace(small, K=small.K + shift, width=side, height=side)
-            )
-        iterations = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
-        times = np.median(iterations, axis=0)
-        return {"batch": batch, "box": {str(side): float(t / times[0]) for side, t in zip(boxes, times, strict=True)}}

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments.harness import Run, entry, figure, means
 from experiments.results import REPOSITORY, cores, markdown_table, significant, write_json
 from humangs_jax.apps import settings as tuning
@@ -236,22 +234,18 @@ def show(run: Run, result: dict[str, Any], image: Path | None, front: bool) -> N
         write_json(FRONT, front_file(rows, result))
     run.show(point_table(rows, result), kept(result), "tradeoff")
     run.show(preset_table(rows, result), table="tradeoff_presets")
-    run.show(naive_table(rows), table="tradeoff_naive")
-    run.show(growth_table(rows, result), table="tradeoff_growth")
     if image:
         for key, name in (("reconstruct", "reconstruction"), ("frame", "frames")):
             draw(rows, key, image.with_name(f"{image.name}_{name}.png"))
 
 
 def kept(result: dict[str, Any]) -> dict[str, Any]:
-    """With means in place of the rows of people, and of presets the PSNR of the first person, which `presets` compares."""
+    """With means in place of the rows of people."""
     points = {}
     for name, found in result["points"].items():
         people = found.get("people") or []
         points[name] = {key: value for key, value in found.items() if key != "people"}
         points[name] |= {"people": len(people)} | (means(people) if people else {})
-        if found["what"]["knob"] == "preset" and people:
-            points[name]["first_person"] = [people[0][task]["psnr"] for task in TASKS]
     return result | {"points": points}
 
 
@@ -382,70 +376,6 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
     ]
     header = ["preset", *MEASURES, *HEADINGS, "below best: same pose", "novel poses", "on the front"]
     return f"{about(result)}\n\n{markdown_table(header, table)}"
-
-
-def naive_table(rows: list[Row]) -> str:
-    """For each naive point the fastest of ours that dominates it."""
-    ours = [row for row in compared(rows) if row["start"] == "network"]
-    table = []
-    for row in compared(rows):
-        if kind(row) != "no network":
-            continue
-        above = better(row, ours)
-        found = min(above, key=lambda r: r["reconstruct"] + r["frame"]) if above else None
-        gain = "" if found is None else f"{quality(found) - quality(row):.2f}"
-        times = [significant(row[key]) for key in ("reconstruct", "frame")]
-        theirs = ["", ""] if found is None else [significant(found[key]) for key in ("reconstruct", "frame")]
-        table.append([row["name"], *times, f"{quality(row):.2f}", found["name"] if found else "none", *theirs, gain])
-    header = [
-        "naive point",
-        "reconstruction",
-        "frame",
-        "PSNR, both",
-        "better and as fast",
-        "reconstruction",
-        "frame",
-        "gain, dB",
-    ]
-    ours_front = front_of(rows)
-    refined = sum(kind(row) == "refined" for row in ours_front)
-    text = f"{len(ours_front)} of {len(ours)} points are on the front, {refined} of them refined."
-    return f"{text} PSNR, both: the mean of both tasks.\n\n{markdown_table(header, table, 'lrrrlrrr')}"
-
-
-def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
-    """Slopes of log time over log size, of the one-knob points with the default."""
-    default = next(row for row in rows if row["name"] == "default")
-    of = lambda *knobs: [row for row in rows if row["knob"] in knobs and row["start"] == "network"]
-    options = lambda row: row["settings"]["runtime"]
-    trained = 256
-    series = {
-        "photos": [(r["settings"]["views"], r["reconstruct"]) for r in [default, *of("photos")]],
-        "pixels of a photo": [
-            ((options(r)["image_size"] or trained) ** 2, r["reconstruct"]) for r in [default, *of("photo size")]
-        ],
-        "people in a batch": [(int(n), share) for n, share in result["growth"].get("batch", {}).items()],
-        "Gaussians, of a frame": [
-            (r["gaussians"], r["frame"]) for r in [default, *of("Gaussians")] if not r["settings"]["prune"]
-        ],
-        "pixels of a frame": [(r["size"] ** 2, r["frame"]) for r in [default, *of("frame size")]],
-        "steps of refinement": [
-            (r["settings"]["refine_steps"], r["refine_share"])
-            for r in of("refinement")
-            if r["settings"]["refine_size"] == trained and not r["settings"]["refine_iterations"]
-        ],
-        "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"].get("box", {}).items()],
-    }
-    table = []
-    for name, pairs in series.items():
-        if len(pairs) < 2:
-            continue
-        pairs = sorted(pairs)
-        sizes, times = zip(*pairs, strict=True)
-        slope = np.polyfit(np.log(sizes), np.log(times), 1)[0]
-        table.append([name, ", ".join(f"{n:,}" for n in sizes), ", ".join(map(significant, times)), f"{slope:.2f}"])
-    text = "Slope 1: in proportion. Background: a person of 256 pixels in larger and larger frames: only what is empty grows."
-    return f"{text}\n\n{markdown_table(['growth with', 'sizes', 'time', 'slope'], table, 'lllr')}"
 
 
 # Images ------------------------------------------------------------------------------------------------------------------
