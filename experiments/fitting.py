@@ -3,14 +3,13 @@
 import dataclasses
 import functools
 import time
-from pathlib import Path
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.harness import Run, entry, figure
+from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
@@ -127,7 +126,7 @@ FIRST = 4_000_000
 
 
 @entry
-def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = True, plot: Path | None = None) -> None:
+def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = True) -> None:
     """How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random poses, errors of a detector.
 
     Errors over views, over noise and over keypoint sets: of all 55 joints in the world, of the body's 22 and of the hands',
@@ -138,20 +137,16 @@ def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = Tr
     people: of the fitting seeds
     frames: of each person
     curves: over views, noise and sets; without, four views of COCO-WholeBody alone
-    plot: picture of the curves (.png)
     """
     if min(people, frames) < 1:
         raise ValueError("--people and --frames: expected at least 1")
-    parts = {"alone": [(ALL, 4, 2.0, share) for share in (0.2, 0.0)]}
+    asked = [(ALL, 4, 2.0, share) for share in (0.2, 0.0)]
     if curves:
-        parts["over_views"] = [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
-        parts["over_noise"] = [(ALL, 4, noise, 0.0) for noise in NOISES]
-        parts["over_sets"] = [(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)]
-    body, made = load_body(), functools.cache(_people)
-    settings = {
-        each: f"{each[0]}, {each[1]} views, {each[2]:g} px, {each[3]:.0%}" for part in parts.values() for each in part
-    }
-    cases = {name: functools.partial(_errors, made, body, people, frames, each) for each, name in settings.items()}
+        asked += [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
+        asked += [(ALL, 4, noise, 0.0) for noise in NOISES]
+        asked += [(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)]
+    settings = {each: f"{each[0]}, {each[1]} views, {each[2]:g} px, {each[3]:.0%}" for each in asked}
+    cases = {name: functools.partial(_errors, people, frames, each) for each, name in settings.items()}
     rows = run.rows(cases, {"people": people, "frames": frames})
     table = []
     for (kind, views, noise, share), name in settings.items():
@@ -167,8 +162,6 @@ def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = Tr
         said += f" With one view and the pelvis put in its place the mean is {alone:.0f} mm."
     header = ["keypoints", "views", "noise, px", "outliers", *COLUMNS.values()]
     run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
-    if plot:
-        plot_keypoints(plot, {part: [(each, rows[settings[each]]) for each in parts[part]] for part in parts})
 
 
 @functools.cache
@@ -176,15 +169,15 @@ def _model(kind):
     return landmark_model(load_body(), KEYPOINT_SETS[kind].names)
 
 
+@functools.cache
 def _people(kind, views, count, frames):
-    body = load_body()
-    return [make_case(FIRST + i, body, _model(kind), frames, views) for i in range(count)]
+    return [make_case(FIRST + i, load_body(), _model(kind), frames, views) for i in range(count)]
 
 
-def _errors(made, body, count, frames, setting):
+def _errors(count, frames, setting):
     """Millimetres, and seconds."""
     kind, views, noise, outliers = setting
-    model, people = _model(kind), made(kind, views, count, frames)
+    model, people = _model(kind), _people(kind, views, count, frames)
     seen = observe(people, FIRST, noise, outliers, model)
     fit_all = jax.vmap(lambda own: fit_landmarks(model, own, FitConfig()))
     times = [time.perf_counter()]
@@ -196,29 +189,6 @@ def _errors(made, body, count, frames, setting):
     found = joint_errors(errors) | landmark_errors(model, people, seen, fit)
     found["root_aligned_mean_joint_error_mm"] = root_aligned(np.asarray(fit.joints), truth)
     return found | {"seconds_per_frame": (times[2] - times[1]) / (count * frames), "first_call_s": times[1] - times[0]}
-
-
-def plot_keypoints(path: Path, parts: dict) -> None:
-    """Error over views and over noise, fit beside triangulation."""
-    over = parts["over_views"]
-    panels = [
-        ([(each[1], row) for each, row in over if not each[3]], "views", "2 px of noise"),
-        ([(each[1], row) for each, row in over if each[3]], "views", "2 px of noise, 20 % outliers"),
-        ([(each[2], row) for each, row in parts["over_noise"]], "noise, pixels of 512", "4 views"),
-    ]
-    lines = {
-        "triangulated_mm": ("plain triangulation", "tab:gray"),
-        "robustly_triangulated_mm": ("robust triangulation", "tab:orange"),
-        "mean_landmark_error_mm": ("fit", "tab:blue"),
-    }
-    with figure(path, 3, (13, 4)) as axes:
-        for axis, (rows, label, title) in zip(axes, panels, strict=True):
-            for name, (line, color) in lines.items():
-                points = [(x, row[name]) for x, row in rows if row.get(name) is not None]
-                axis.plot(*zip(*points, strict=True), "o-", label=line, color=color)
-            axis.set(xlabel=label, ylabel="landmarks, mean mm", title=title)
-            axis.set_yscale("log" if label == "views" else "symlog")
-        axes[0].legend()
 
 
 def joint_errors(errors) -> dict:

@@ -151,17 +151,8 @@ def solved(rows):
 VIEWS, SIZE = 4, 256
 
 
-COLUMNS = {
-    "true_psnr": "PSNR, true parameters",
-    "fitted_psnr": "PSNR, fitted",
-    "true_foreground": "foreground PSNR, true",
-    "fitted_foreground": "foreground PSNR, fitted",
-    "true_refined_psnr": "PSNR, true, refined",
-    "fitted_refined_psnr": "PSNR, fitted, refined",
-    "true_refined_foreground": "foreground PSNR, true, refined",
-    "fitted_refined_foreground": "foreground PSNR, fitted, refined",
-    "joints_mm": "joint error, mm",
-}
+SCORES = {"psnr": "PSNR", "foreground": "foreground PSNR", "refined_psnr": "PSNR, refined"}
+SCORES |= {"refined_foreground": "foreground PSNR, refined"}
 
 
 @entry
@@ -212,9 +203,15 @@ def fit_end_to_end(
 
     settings = {"noise_px": noise_px, "outliers": outliers, "set": kind, "seconds": seconds}
     rows = run.rows({str(seed): functools.partial(measure, seed) for seed in range(FIRST, FIRST + people)}, settings)
-    shown = rows | {"mean": means(list(rows.values()))}
-    cells = [[name, *(f"{row[key]:.2f}" for key in COLUMNS)] for name, row in shown.items()]
-    run.show(markdown_table(["person", *COLUMNS.values()], cells), {"settings": settings, "means": shown["mean"]})
+    mean = means(list(rows.values()))
+    run.show(end_to_end_table(mean, len(rows)), {"settings": settings, "means": mean, "people": len(rows)})
+
+
+def end_to_end_table(mean: dict[str, float], people: int) -> str:
+    """Of true and of fitted parameters."""
+    cells = [[f"{name} parameters", *(f"{mean[f'{name}_{key}']:.2f}" for key in SCORES)] for name in ("true", "fitted")]
+    text = markdown_table([f"means over {people} people", *SCORES.values()], cells)
+    return f"{text}\n\nMean joint error of the fits: {mean['joints_mm']:.1f} mm."
 
 
 def fitted_capture(photos, body, seed, kind, noise_px, outliers):

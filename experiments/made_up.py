@@ -198,7 +198,15 @@ class Video:
     parameters: of the model file in that world. cameras: ours; K (3, 3), R (c, 3, 3), T (c, 3) that a calibration has.
     """
 
-    def __init__(self, out: Path, seed: int, frames: int, cameras: int, size: tuple[int, int], vertices: Any):
+    def __init__(
+        self,
+        out: Path,
+        seed: int = SEEDS[0],
+        frames: int = 3,
+        cameras: int = 4,
+        size: tuple[int, int] = (150, 204),
+        vertices: int | None = None,
+    ):
         people, _, small = make_people([seed], vertices)
         motion = sample_motion(people[0], 30, "walk")
         rows = np.linspace(0, 29, frames).round().astype(int)
@@ -268,17 +276,10 @@ class Video:
         np.savez(path, **{key: value.astype(np.float32) for key, value in arrays.items()})  # ty: ignore[invalid-argument-type]
 
 
-def write_avatarrex(
-    out: Path,
-    seed: int = SEEDS[0],
-    frames: int = 3,
-    cameras: int = 4,
-    size: tuple[int, int] = (150, 204),
-    vertices: Any = None,
-) -> Path:
-    """out/body.npz and out/avatarrex_zzr with photos of every 10th frame; returns the subject's folder."""
-    video, folder = Video(out, seed, frames, cameras, size, vertices), out / "avatarrex_zzr"
-    serials = [f"220{i:05d}" for i in range(cameras)]
+def write_avatarrex(out: Path, **how: Any) -> Path:
+    """out/body.npz and out/avatarrex_zzr with photos of every 10th frame; returns the subject's folder. how: of a `Video`."""
+    video, folder = Video(out, **how), out / "avatarrex_zzr"
+    serials = [f"220{i:05d}" for i in range(len(video.cameras))]
     place = lambda c, f: tuple(folder / serials[c] / part / f"{10 * f:08d}.jpg" for part in ("", "mask/pha"))
     video.write(place)
     (folder / "calibration_full.json").write_text(json.dumps(video.calibration(serials)))
@@ -286,43 +287,29 @@ def write_avatarrex(
     return folder
 
 
-def write_thuman4(
-    out: Path,
-    seed: int = SEEDS[0],
-    frames: int = 3,
-    cameras: int = 4,
-    size: tuple[int, int] = (166, 144),
-    vertices: Any = None,
-) -> Path:
-    """out/body.npz and out/subject00, a photo of which is listed as missing; returns the subject's folder."""
-    video, folder = Video(out, seed, frames, cameras, size, vertices), out / "subject00"
-    names = [f"cam{i:02d}" for i in range(cameras)]
+def write_thuman4(out: Path, size: tuple[int, int] = (166, 144), **how: Any) -> Path:
+    """out/body.npz and out/subject00, a photo of which is listed as missing; returns the subject's folder. how: of a `Video`."""
+    video, folder = Video(out, size=size, **how), out / "subject00"
+    names, last = [f"cam{i:02d}" for i in range(len(video.cameras))], len(video.posed) - 1
     video.write(lambda c, f: tuple(folder / kind / names[c] / f"{f:08d}.jpg" for kind in ("images", "masks")))
-    (folder / "images" / names[-1] / f"{frames - 1:08d}.jpg").unlink()
-    (folder / "missing_img_files.txt").write_text(f"images\\{names[-1]}\\{frames - 1:08d}.jpg\n")
+    (folder / "images" / names[-1] / f"{last:08d}.jpg").unlink()
+    (folder / "missing_img_files.txt").write_text(f"images\\{names[-1]}\\{last:08d}.jpg\n")
     (folder / "calibration.json").write_text(json.dumps(video.calibration(names)))
     video.write_parameters(folder / "smpl_params.npz")
     return folder
 
 
-def write_actorshq(
-    out: Path,
-    seed: int = SEEDS[0],
-    frames: int = 2,
-    cameras: int = 3,
-    size: tuple[int, int] = (150, 204),
-    vertices: Any = None,
-) -> Path:
-    """out/body.npz and out/Actor01/Sequence1 at scale 4x; returns the sequence's folder."""
-    video, folder = Video(out, seed, frames, cameras, size, vertices), out / "Actor01" / "Sequence1"
-    names = [f"Cam{i + 1:03d}" for i in range(cameras)]
+def write_actorshq(out: Path, **how: Any) -> Path:
+    """out/body.npz and out/Actor01/Sequence1 at scale 4x; returns the sequence's folder. how: of a `Video`."""
+    video, folder = Video(out, **how), out / "Actor01" / "Sequence1"
+    names = [f"Cam{i + 1:03d}" for i in range(len(video.cameras))]
 
     def place(c: int, f: int) -> tuple[Path, Path]:
         photo = folder / "4x" / "rgbs" / names[c] / f"{names[c]}_rgb{f:06d}.jpg"
         return photo, folder / "4x" / "masks" / names[c] / f"{names[c]}_mask{f:06d}.png"
 
     video.write(place, background=0.0)
-    width, height = size
+    width, height = video.cameras[0].width, video.cameras[0].height
     with open(folder / "4x" / "calibration.csv", "w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"])
@@ -335,23 +322,14 @@ def write_actorshq(
     return folder
 
 
-def write_dna(
-    out: Path,
-    seed: int = SEEDS[0],
-    frames: int = 2,
-    cameras: int = 3,
-    size: tuple[int, int] = (150, 204),
-    vertices: Any = None,
-    enlarged: int = 1,
-    lens: Sequence[float] = (0.0,) * 5,
-) -> Path:
+def write_dna(out: Path, enlarged: int = 1, lens: Sequence[float] = (0.0,) * 5, **how: Any) -> Path:
     """out/body.npz and out/dna with main/0001_01.smc and its annotations; returns the data set. Needs h5py.
 
     enlarged: how many pixels a side each rendered one becomes. lens: k1 k2 p1 p2 k3 that the file names, for measuring what
-    undistortion takes; photos are rendered without.
+    undistortion takes; photos are rendered without. how: of a `Video`.
     """
     h5py: Any = importlib.import_module("h5py")
-    video, folder = Video(out, seed, frames, cameras, size, vertices), out / "dna"
+    video, folder = Video(out, **how), out / "dna"
     means = np.load(out / "body.npz")
     for part in ("main", "annotations"):
         (folder / part).mkdir(parents=True)
@@ -386,8 +364,8 @@ def write_dna(
         values = {
             "fullpose": rotations,
             "transl": video.parameters.translations,
-            "betas": np.tile(video.parameters.betas[:COLUMNS], (frames, 1)),
-            "expression": np.zeros((frames, COLUMNS)),
+            "betas": np.tile(video.parameters.betas[:COLUMNS], (len(rotations), 1)),
+            "expression": np.zeros((len(rotations), COLUMNS)),
             "scale": np.ones(1),
         }
         for key, value in values.items():
