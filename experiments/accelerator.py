@@ -1,11 +1,8 @@
-"""A day on an accelerator: agreement with the CPU, times, the batch that fits, training."""
+"""What an accelerator does: agreement with the CPU, times, the batch that fits."""
 
 import dataclasses
 import functools
-import json
-import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -19,7 +16,6 @@ from experiments.reconstruction import benchmark, configured
 from experiments.results import markdown_table
 from experiments.splatting import demo_scene
 from experiments.timing import medians
-from experiments.train_shipped import main as train_shipped
 from experiments.training import Case
 from humangs_jax.avatar.frames import motion_frames
 from humangs_jax.avatar.reconstruct import reconstruct
@@ -37,64 +33,34 @@ from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.people.subject import SPLITS
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.rendering.splatting import plan_buffers, render
-from humangs_jax.training.config import small, tiny
+from humangs_jax.training.config import tiny
 from humangs_jax.training.loop import train as train_run
 
-RESERVE = 0.1
-"""Share of the time in which nothing new begins."""
 COUNTS = (20_000, 52_000, 140_000, 500_000)
 """Gaussians of the scenes."""
-
-
-Stage = Literal["check", "splatting", "network", "frames", "batch", "train"]
-Measurement = tuple[str, Callable[[], Any]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Day:
-    """Options:
-    out: folder for weights.safetensors and train_log.jsonl
-    minutes: for all stages of this call
-    people: made on the host before training, if --bank names none
-    bank: people.npz of another run
-    init_weights: weights to start the training from; default: the shipped ones
-    tiny: sizes that a CPU rehearses in minutes
-    """
-
-    out: Path = Path()
-    minutes: float = 9.0
-    people: int = 200
-    bank: Path | None = None
-    init_weights: Path | None = None
-    tiny: bool = False
-    deadline: float = 0.0
+Stage = Literal["check", "splatting", "network", "frames", "batch"]
+Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
 @entry
-def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), day: Day = Day()) -> None:
-    """A day on an accelerator in stages of at most ten minutes; what --json OUT has is not measured again.
+def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False) -> None:
+    """What an accelerator does: agreement with the CPU, times, the batch that fits. What fails is noted, and the next one begins.
 
     check: the same numbers on CPU and device: the shipped network, splatting by the schedule of each with gradients, a resumed
-    run.
-    splatting: forward and with gradients, beside gsplat if it is installed. network: the published one beside plain products of
-    as many operations. frames: of an animation, and people rendered on the fly. batch: steps of training at batch sizes until
-    memory ends. train: the preset `small` at the fastest of them. No measurement begins when less than a tenth of the time is
-    left.
+    run. splatting: forward and with gradients, beside gsplat if it is installed. network: the published one beside plain products
+    of as many operations. frames: of an animation, and people rendered on the fly. batch: steps of training at batch sizes until
+    memory ends.
 
     Options:
     stage: which
+    small: sizes that a CPU rehearses in minutes
     """
-    day.out.mkdir(parents=True, exist_ok=True)
-    day, found = dataclasses.replace(day, deadline=time.monotonic() + 60 * day.minutes), {}
-    makers = {"check": check, "splatting": splatting, "network": network, "frames": frames, "train": train}
-    makers["batch"] = batch_sizes
-    settings = {"device": jax.devices()[0].device_kind, "tiny": day.tiny}
-    for name in stage:
-        for what, measure in makers[name](day, found):
-            if day.deadline - time.monotonic() < RESERVE * 60 * day.minutes:
-                print(f"{name}: {what}: no time left", flush=True)
-                continue
-            found |= run.rows({f"{name}: {what}": functools.partial(_tried, measure)}, settings)
+    makers = {"check": check, "splatting": splatting, "network": network, "frames": frames, "batch": batch_sizes}
+    settings = {"device": jax.devices()[0].device_kind, "small": small}
+    cases = {
+        f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in makers[name](small)
+    }
+    found = run.rows(cases, settings)
     rows = [
         [what, key, f"{value:.4g}" if isinstance(value, float) else str(value)]
         for what, numbers in found.items()
@@ -107,11 +73,11 @@ def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), day: Day =
 def _tried(measure):
     try:
         return measure()
-    except Exception as error:  # the next measurement may work; the time on the device does not come back
+    except Exception as error:  # the next measurement may work
         return {"failed": f"{type(error).__name__}: {str(error)[:300]}"}
 
 
-def check(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
+def check(small: bool) -> Iterator[Measurement]:
     """Differences between the device and the CPU of the same process."""
     places = {"CPU": jax.devices("cpu")[0], "device": jax.devices()[0]}
 
@@ -135,7 +101,7 @@ def check(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
         return errors(everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs))
 
     def splat():
-        scene = demo_scene(64 if day.tiny else 256, 1_000 if day.tiny else COUNTS[0])
+        scene = demo_scene(64 if small else 256, 1_000 if small else COUNTS[0])
         gaussians, camera = scene
         config = plan_buffers(gaussians, camera)
         target = jnp.asarray(np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32))
@@ -148,7 +114,7 @@ def check(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
 
     yield "shipped network, relative error", pass_once
     yield "splatting with gradients, relative error", splat
-    yield "resumed run", lambda: resumed()
+    yield "resumed run", resumed
 
 
 def resumed() -> dict[str, Any]:
@@ -166,9 +132,9 @@ def resumed() -> dict[str, Any]:
     return {"largest difference": difference, "bitwise": difference == 0}
 
 
-def splatting(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
+def splatting(small: bool) -> Iterator[Measurement]:
     """Milliseconds of an image, alone and with gradients."""
-    counts, sizes = ((1_000,), (64,)) if day.tiny else (COUNTS, (256, 512, 1024))
+    counts, sizes = ((1_000,), (64,)) if small else (COUNTS, (256, 512, 1024))
 
     def measure(count, size):
         gaussians, camera = demo_scene(size, count)
@@ -211,22 +177,22 @@ def gsplat_runs(gaussians, camera):
     return {"gsplat, forward": draw, "gsplat, with gradients": gradient}
 
 
-def network(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
+def network(small: bool) -> Iterator[Measurement]:
     """`reconstruction.benchmark` of the published network."""
-    preset, sizes = ("tiny", (32,)) if day.tiny else ("published", (256, 512))
+    preset, sizes = ("tiny", (32,)) if small else ("published", (256, 512))
     for size in sizes:
         yield f"{preset} {size}", lambda size=size: benchmark(configured(preset, size), 4, size, 5)
 
 
-def frames(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
+def frames(small: bool) -> Iterator[Measurement]:
     """Frames of an animation a second, and people made on the fly a second."""
-    size, people, batches = (64, 1, (1,)) if day.tiny else (512, 8, (1, 8, 32))
+    size, people, batches = (64, 1, (1,)) if small else (512, 8, (1, 8, 32))
 
     def animation():
         avatar, motion = reconstruct(*load_weights(), load_capture("demo_capture")), load_motion(None)
         count = len(motion.translations)
         draw = {"all": lambda: sum(1 for _ in motion_frames(avatar, motion, Shot(size=size), progress=False))}
-        return {"frames a second": 1e3 * count / float(medians(draw, 1 if day.tiny else 3)["all"][0])}
+        return {"frames a second": 1e3 * count / float(medians(draw, 1 if small else 3)["all"][0])}
 
     def on_the_fly(batch):
         bank = build_bank(SPLITS["train"][:people], load_body(), "train", processes=1, progress=False)
@@ -241,9 +207,9 @@ def frames(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
         yield f"{batch} people on the fly", lambda batch=batch: on_the_fly(batch)
 
 
-def batch_sizes(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
+def batch_sizes(small: bool) -> Iterator[Measurement]:
     """Steps of the preset `small` at growing batches; too large a batch fails, and ends the stage by failing all larger ones."""
-    preset, size, sizes = ("tiny", 32, (1, 2)) if day.tiny else ("small", 256, (1, 2, 4, 8, 16, 32, 64))
+    preset, size, sizes = ("tiny", 32, (1, 2)) if small else ("small", 256, (1, 2, 4, 8, 16, 32, 64))
 
     def measure(batch):
         with tempfile.TemporaryDirectory() as folder:
@@ -263,33 +229,3 @@ def batch_sizes(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
 
     for batch in sizes:
         yield f"batch {batch}", lambda batch=batch: measure(batch)
-
-
-def train(day: Day, found: dict[str, Any]) -> Iterator[Measurement]:
-    """The rest of the time: training at the fastest batch, from weights to weights."""
-
-    def measure():
-        batch = fastest_batch(found)
-        config = dataclasses.replace(tiny() if day.tiny else small(), batch_size=batch, microbatch_size=batch)
-        if day.tiny:
-            config = dataclasses.replace(config, steps=4, validate_every=4, checkpoint_every=4)
-        hours = (day.deadline - time.monotonic()) / 3600 * (1 - RESERVE)
-        run, start = Path(tempfile.mkdtemp()), time.perf_counter()
-        weights = day.init_weights or (None if day.tiny else "shipped")
-        people = 1 if day.tiny else day.people
-        train_shipped(run, people, day.bank, hours=hours, init_weights=weights, config=config)
-        shutil.copy(run / "weights.safetensors", day.out / "weights.safetensors")
-        shutil.copy(run / "log.jsonl", day.out / "train_log.jsonl")
-        rows = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-        last = max((row.get("step", 0) for row in rows), default=0)
-        shutil.rmtree(run)
-        return {"batch": batch, "steps": last, "seconds": time.perf_counter() - start}
-
-    yield f"from {day.init_weights or 'shipped weights'}", measure
-
-
-def fastest_batch(found: dict[str, Any]) -> int:
-    """The batch with most subjects a second; 1 where none was measured."""
-    speed = "subjects a second"
-    speeds = {int(name.split()[-1]): row[speed] for name, row in found.items() if speed in row}
-    return max(speeds, key=lambda batch: speeds[batch], default=1)
