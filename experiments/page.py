@@ -15,7 +15,6 @@ from experiments.subjects import shipped_person
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -32,7 +31,6 @@ VERTICAL_FOV = math.pi / 6
 FINE_EDGE = 0.017
 """Metres; the longest edge of a body that carries some 60,000 Gaussians."""
 MOTION_WINDOW = (480, 600)
-KEPT_WEIGHTS = (2, 4, 6, 8)
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
     ("foreground PSNR, dB", "person"),
@@ -58,7 +56,6 @@ def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20
     if reason := missing():
         raise ValueError(reason)
     avatars = {"avatar": Avatar.load(avatar) if avatar else shipped_person(), "finer": shipped_person(FINE_EDGE)}
-    kept = truncation_scores(avatars["avatar"], size)
     with tempfile.TemporaryDirectory() as folder:
         rows = [_measured(each, Path(folder) / f"{name}.html", size, frames) for name, each in avatars.items()]
     header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
@@ -67,9 +64,7 @@ def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20
     lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
     lines.append([f"frames per second, {size} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
     lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
-    kept_row = [["foreground PSNR, dB", *(f"{value:.0f}" for value in kept.values())]]
-    text = markdown_table(header, lines) + "\n\n" + markdown_table(["skinning weights kept", *kept], kept_row)
-    run.show(text, {"size": size, "weights_kept": kept} | dict(zip(avatars, rows, strict=True)))
+    run.show(markdown_table(header, lines), {"size": size} | dict(zip(avatars, rows, strict=True)))
 
 
 def _measured(avatar, file, size, frames):
@@ -160,17 +155,3 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
         np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]
     )
     return compare(image, avatar, camera, pose)
-
-
-def truncation_scores(avatar: Avatar, size: int) -> dict[str, float]:
-    """foreground PSNR, dB, of `hg.render` in a pose of the walk, by the number of skinning weights kept of each Gaussian."""
-    cameras, poses = test_views(avatar, size)
-    scores = {}
-    for kept in KEPT_WEIGHTS:
-        weights = avatar.skinning_weights
-        least = jnp.sort(weights, axis=1)[:, -kept][:, None]
-        weights = jnp.where(weights >= least, weights, 0.0)
-        fewer = replace(avatar, skinning_weights=weights / weights.sum(1, keepdims=True))
-        image = jnp.clip(render(skin(fewer, poses["walk"]), cameras[0]).rgb, 0, 1)
-        scores[str(kept)] = compare(image, avatar, cameras[0], poses["walk"])[1]
-    return scores

@@ -1,21 +1,14 @@
-"""The points of the trade of speed against accuracy; its tables, images and front; budgets, measured again."""
+"""The points of the trade of speed against accuracy; its tables, images and front."""
 
-import contextlib
 import dataclasses
 import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-from experiments.harness import Run, entry, figure, means
-from experiments.results import REPOSITORY, cores, markdown_table, significant, write_json
-from humangs_jax.apps import settings as tuning
+from experiments.harness import Run, figure, means
+from experiments.results import REPOSITORY, markdown_table, significant, write_json
 from humangs_jax.apps.settings import PRESETS, Settings
-from humangs_jax.data.capture import load_capture
 from humangs_jax.network.runtime import Runtime
-from humangs_jax.network.weights import load_weights
 
 SIZE = 512
 """Side of the frames that points are compared at."""
@@ -139,81 +132,6 @@ SHORT = {
 def combined(**fields: Any) -> Point:
     """A point named by its settings."""
     return point(", ".join(SHORT[key].format(value) for key, value in fields.items()), "combined", **fields)
-
-
-MULTIPLES = ((0.5, 0.5), (2.0, 2.0), (6.0, 3.0))
-"""Budgets for a reconstruction and for a frame, in times of the fastest setting."""
-BUSY = """
-import numpy as np
-x = np.random.default_rng(0).random((500, 500))
-while True:
-    x @ x
-"""
-
-
-@contextlib.contextmanager
-def busy(count: int) -> Any:
-    """`count` processes, each of which keeps one core busy until the block ends."""
-    one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
-    processes = [subprocess.Popen([sys.executable, "-c", BUSY], env=os.environ | one_thread) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
-@entry
-def tune_budgets(run: Run, load: int | None = None, runs: int = 10, size: int = 256) -> None:
-    """Whether what `humangs tune` chooses stays within its budget on a busy machine.
-
-    While other processes multiply matrices, one core each, settings are chosen for the demo capture: for budgets of some
-    multiples of what the fastest setting takes then. What was chosen is measured again as `tune` measures: the slowest of some
-    reconstructions, the 90th percentile of some frames. A run is within the budget if both are.
-
-    Options:
-    load: busy processes beside it (default: one for each core)
-    runs: measurements of each choice
-    size: side of the frames, pixels
-    """
-    load = cores() or 1 if load is None else load
-    network, capture, rows = load_weights(), load_capture("demo_capture"), []
-    with busy(load):
-        fastest = tuning.measure(tuning.load_front()[0].settings, *network, capture, size)
-        for make, frame in MULTIPLES:
-            budget = tuning.Budget(make * fastest.reconstruct_ms, frame * fastest.frame_ms)
-            most = {"reconstruct_ms": budget.reconstruct_ms, "frame_ms": budget.frame_ms}
-            row: dict[str, Any] = dict(most)
-            rows.append(row)
-            try:
-                tuned = tuning.tune(*network, capture, size=size, **most)  # ty: ignore[invalid-argument-type]
-            except tuning.NoSettingError as error:
-                row["refused"] = str(error)
-                continue
-            costs = [tuning.measure(tuned.point.settings, *network, capture, size) for _ in range(runs)]
-            row |= {"chosen": tuned.point.name, "tuned": dataclasses.asdict(tuned.cost)}
-            row |= {"runs": [dataclasses.asdict(cost) for cost in costs]}
-            row["within"] = sum(budget.allows(cost, margin=1.0) for cost in costs)
-    lines = []
-    for row in rows:
-        budget = [f"{row['reconstruct_ms']:.0f}", f"{row['frame_ms']:.0f}"]
-        if "refused" in row:
-            lines.append([*budget, "no setting is within the budget", "", "", ""])
-            continue
-        whole = [cost["make_ms"] + cost["refine_ms"] for cost in (row["tuned"], *row["runs"])]
-        frame = [cost["frame_ms"] for cost in (row["tuned"], *row["runs"])]
-        spread = lambda times: f"{times[0]:.0f}; {min(times[1:]):.0f} to {max(times[1:]):.0f}"
-        lines.append([*budget, row["chosen"], spread(whole), spread(frame), f"{row['within']} of {len(row['runs'])}"])
-    header = [
-        "ms a reconstruction",
-        "ms a frame",
-        "chosen",
-        "reconstruction: tuned; later",
-        "frame: tuned; later",
-        "within",
-    ]
-    run.show(markdown_table(header, lines, "rrlrrr"), {"load": load, "size": size, "budgets": rows})
 
 
 FRONT = REPOSITORY / "humangs_jax" / "assets" / "front.json"
