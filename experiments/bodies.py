@@ -3,12 +3,9 @@
 import dataclasses
 import functools
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,7 +14,6 @@ from experiments.quality import COLUMNS, cells
 from experiments.results import markdown_table
 from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.sheets import contact_sheet
 from humangs_jax.body.library import EXPRESSION_COLUMNS, SHAPE_COLUMNS, load_body
 from humangs_jax.body.model import JOINT_NAMES, BodyModel
 from humangs_jax.body.resolution import decimate
@@ -34,93 +30,51 @@ PAINTED = "painted default body"
 
 
 @entry
-def evaluation_bodies(run: Run, people: People = People(8), views: int = 4, images: Path | None = None) -> None:
+def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> None:
     """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and fewer vertices.
 
     "SMPL-X format": a made-up body of another topology, written as an SMPL-X file and read by its loader; the poses go to its
     joints by name. "1/4" and "1/16" of the default body's vertices, as they are and with long edges split as the weights want
-    it. Costs are seconds of compiled programs: photos to avatar, without choosing the body's vertices, which is done once a
-    body; posing and drawing one image. About 10 s of CPU time a person, and some minutes of compiling.
+    it. About 10 s of CPU time a person, and some minutes of compiling.
 
     Options:
     views: photos that the network sees
-    images: the truth and every body's image of the first person
     """
     if views < 1 or RING % views:
         raise ValueError(f"--views: expected a number that divides {RING}, got {views}")
     start = people.start()
-    settings = start.settings | {"views": views, "device": jax.devices()[0].device_kind}
     cases, config = body_cases(start.body, start.config), as_it_is(start.config)
 
-    def measure(seed):
+    def measure(seed: int) -> dict[str, Any]:
         subject = make_evaluation_subject(seed, start.body, [views], start.size, start.held_out)
-        truth, drawn = subject.held_out, {"truth": subject.held_out.images}
-        row: dict[str, Any] = {
-            PAINTED: score_tasks(draw_painted_body(painted_body(subject.inputs(views)), truth), truth, start.lpips)
-        }
+        truth, painted = subject.held_out, painted_body(subject.inputs(views))
+        row = {PAINTED: score_tasks(draw_painted_body(painted, truth), truth, start.lpips)}
         for name, case in cases.items():
             other = subject.with_body(case.carrier)
-            inputs = other.inputs(views)
-            make = lambda inputs=inputs: jax.block_until_ready(reconstruct(start.variables, config, inputs))
-            avatar, passes = timed(make)
-            drawn[name], frames = timed(lambda avatar=avatar, other=other: draw_views(avatar, other.held_out).images)
-            seconds = {"reconstruct": passes, "frame": [x / truth.view_count for x in frames]}
-            costs = {
-                f"{step}{mark}": x for step, pair in seconds.items() for mark, x in zip(("", "_cpu"), pair, strict=True)
-            }
-            costs["gaussians"] = len(avatar.gaussians.means)
-            row[name] = score_tasks(drawn[name], truth, start.lpips) | {"costs": costs}
-        return row, drawn
+            avatar = reconstruct(start.variables, config, other.inputs(views))
+            row[name] = score_tasks(draw_views(avatar, other.held_out).images, truth, start.lpips)
+        return row
 
-    people_rows = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
-    rows = list(run.rows(people_rows, settings, again=bool(images)).values())
-    if images:
-        shown = [0, start.held_out.views] if start.held_out.poses else [0]
-        drawn = run.pictures[str(start.seeds[0])]
-        tiles = np.stack([pictures[view] for view in shown for pictures in drawn.values()])
-        contact_sheet(tiles, images, headers=list(drawn), columns=len(drawn))
+    settings = start.settings | {"views": views}
+    rows = list(run.rows({str(seed): functools.partial(measure, seed) for seed in start.seeds}, settings).values())
     bodies = means(
         [{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows]
     )
     for name, case in cases.items():
         bodies[name] |= {"body_vertices": len(case.body.template), "vertices": len(case.carrier.template)}
-        each = [row[name]["costs"] for row in rows]
-        bodies[name]["costs"] = {key: float(np.median([costs[key] for costs in each])) for key in each[0]}
-    how = f"{views} photos. Medians of the seconds over people, compiled programs, device: {settings['device']}."
     numbers = {"bodies": bodies, "settings": settings, "people": len(rows)}
-    run.show(f"{start.about()} {how}\n\n{bodies_table(bodies)}", numbers)
-
-
-def timed(work: Callable[[], Any]) -> tuple[Any, tuple[float, float]]:
-    """The result, and the seconds, by the clock and of CPU time, of the second of two runs: the first may compile."""
-    work()
-    clock, cpu = time.perf_counter(), time.process_time()
-    result = work()
-    return result, (time.perf_counter() - clock, time.process_time() - cpu)
+    run.show(f"{start.about()} {views} photos.\n\n{bodies_table(bodies)}", numbers)
 
 
 def bodies_table(bodies: dict[str, Any]) -> str:
-    """A row a body, what it costs and how well it matches."""
+    """A row a body, and how well it matches."""
     tasks = [task for task in TASKS if task in bodies[PAINTED]]
     keys = [key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
-    header = [
-        "body",
-        "vertices",
-        "that carry Gaussians",
-        "Gaussians",
-        "reconstruct: wall, CPU s",
-        "frame: wall, CPU ms",
-    ]
+    header = ["body", "vertices", "that carry Gaussians"]
     header += [f"{TASKS[task]}: {COLUMNS[key][0]}" for task in tasks for key in keys]
-    table = []
-    for name, body in bodies.items():
-        facts = ["-"] * 5
-        if costs := body.get("costs"):
-            seconds = ", ".join(f"{costs[key]:.2f}" for key in ("reconstruct", "reconstruct_cpu"))
-            milliseconds = ", ".join(f"{1e3 * costs[key]:.0f}" for key in ("frame", "frame_cpu"))
-            facts = [body["body_vertices"], body["vertices"], int(costs["gaussians"]), seconds, milliseconds]
-        table.append([name, *facts, *(number for task in tasks for number in cells(body[task], keys))])
-    return markdown_table(header, table)
+    facts = lambda body: [body.get("body_vertices", "-"), body.get("vertices", "-")]
+    scores = lambda body: [number for task in tasks for number in cells(body[task], keys)]
+    return markdown_table(header, [[name, *facts(body), *scores(body)] for name, body in bodies.items()])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
