@@ -195,14 +195,14 @@ class Run:
         if self.json:
             write_json(self.json, run_record(self.name, self.options) | self._written)
 
-    def show(self, text: str, numbers: Any = None, table: str | None = None, row: str | None = None) -> None:
-        """Prints a section; --json OUT gets its numbers, with --publish the docs get both (see `results.publish` for row)."""
+    def show(self, text: str, numbers: Any = None, table: str | None = None) -> None:
+        """Prints a section; --json OUT gets its numbers, with --publish the docs get both."""
         print(text)
         table = table or self.table
         self._written.setdefault("numbers", {})[table] = numbers
         self._write()
         if self.publish:
-            publish(page_of(table), table, text, numbers, row, run_record(self.name, self.options))
+            publish(page_of(table), table, text, numbers, run_record(self.name, self.options))
 
 
 def means(rows: Sequence[Row]) -> Row:

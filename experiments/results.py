@@ -124,40 +124,17 @@ def publish(
     name: str,
     text: str,
     numbers: object = None,
-    row: str | None = None,
     record: dict[str, Any] | None = None,
 ) -> None:
     """Writes docs/results/NAME.json, and the page's section of that name.
 
-    row: the first cell of the rows of this run. They replace those of the same name, other rows and their numbers stay.
     record: what made it, by default this process (`run_record`).
     """
     folder = next(parent for parent in page.parents if (parent / "docs").is_dir()) / "docs"
     path, blocks = folder / "results" / f"{name}.json", blocks_of(text)
     record = record or run_record()
-    if row is not None and path.exists():
-        old = json.loads(path.read_text())
-        blocks, record["source"] = merged(old["blocks"], blocks), old.get("source")
-        numbers = (old["numbers"] or {}) | {row: numbers}
-    elif row is not None:
-        numbers = {row: numbers}
     write_json(path, record | {"blocks": blocks, "numbers": numbers})
     write_text(page, rendered(page.read_text(), path.parent, (name,)))
-
-
-def merged(old: Sequence[Any], new: Sequence[Any]) -> list[Any]:
-    """Old blocks with the rows of new tables of the same header, by their first cells; other new blocks behind them."""
-    blocks = list(old)
-    for block in new:
-        same = [
-            i for i, o in enumerate(blocks) if o == block or (isinstance(o, dict) and o["header"] == block["header"])
-        ]
-        if not same:
-            blocks.append(block)
-        elif isinstance(block, dict):
-            rows = {row[0]: row for row in (*blocks[same[0]]["rows"], *block["rows"])}
-            blocks[same[0]] = block | {"rows": list(rows.values())}
-    return blocks
 
 
 def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> str:

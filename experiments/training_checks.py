@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.harness import Run, entry, figure
+from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from experiments.training import random_networks, settings, written_subject
 from humangs_jax.body.library import load_body
@@ -35,11 +35,10 @@ from humangs_jax.training.step import subject_loss, train_step
 PLAIN = "as it is"
 PEOPLE, SIZE, CARRIERS, STEPS, LAST = 3, 64, 1000, 40, 5
 REPEATED = 4
-DRAWN = (PLAIN, "learning rate x 100", "loss x 1e6")
 
 
 @entry
-def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS, image: Path | None = None) -> None:
+def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS) -> None:
     """Training at the extremes: what a run does, and what its log says.
 
     Short runs of the smallest network on three synthetic people, each as `humangs train` makes it, with one thing changed.
@@ -50,7 +49,6 @@ def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS, 
     Options:
     only: names of runs
     steps: of each run
-    image: the curves of some runs are drawn here
     """
     jax.config.update("jax_disable_most_optimizations", True)  # most of the time of such short runs is compilation
     body, base = load_body(), base_config()
@@ -77,28 +75,6 @@ def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS, 
         rows.append([name, loss, psnr, f"{row['gradient']:.2g}", row["clipped"], row["skipped"], told or "nothing"])
     header = ["run", "loss", "PSNR", "gradient", "clipped", "skipped", "log"]
     run.show(markdown_table(header, rows, "lrrrrrl"), results)
-    if image:
-        plot(image, results)
-
-
-def plot(path: Path, results: dict[str, Any]) -> None:
-    """Loss and gradient norm of the runs of `DRAWN`, with the guard's bounds and the steps that it skipped."""
-    with figure(path, 2, (9, 3.4)) as (left, right):
-        for i, name in enumerate(name for name in DRAWN if name in results):
-            curve, color = results[name]["curve"], f"C{i}"
-            steps = np.arange(1, len(curve["loss"]) + 1)
-            gradient, skipped = np.asarray(curve["gradient"], float), np.asarray(curve["skipped"], bool)
-            left.plot(steps, np.asarray(curve["loss"], float), color=color, label=name)
-            right.plot(steps, gradient, color=color, lw=1)
-            right.plot(steps[skipped], gradient[skipped], "x", color=color, ms=4)
-        for bound, color, text in zip(
-            results[PLAIN]["bounds"], ("0.5", "0.2"), (" scaled down above", " skipped above (x)"), strict=True
-        ):
-            right.axhline(bound, color=color, ls="--", lw=1)
-            right.text(1, bound, text, va="bottom", fontsize=7, color="0.3")
-        left.set(xlabel="step", ylabel="loss, over its scale", yscale="log")
-        right.set(xlabel="step", ylabel="gradient norm before clipping", yscale="log")
-        left.legend(fontsize=7)
 
 
 def base_config() -> Any:
@@ -210,25 +186,18 @@ def outcome(
     steps = [line for line in lines if "event" not in line]
     events = Counter(line["event"] for line in lines if "event" in line)
     scale = config.loss.squared / base.loss.squared
-    curve = {
-        "loss": [None if line["loss"] is None else line["loss"] / scale for line in steps],
-        "psnr": [line["psnr"] for line in steps],
-        "gradient": [line["grad_norm"] for line in steps],
-        "skipped": np.diff([0, *(line["skipped"] for line in steps)]).astype(int).tolist(),
-    }
-    norms = np.asarray([np.inf if x is None else x for x in curve["gradient"]])  # JSON has no infinity
-    bounds = [config.optimizer.clip_norm, config.optimizer.skip_norm]
+    mean = lambda key: float(np.mean([line[key] for line in steps[-LAST:] if line[key] is not None]))
+    norms = np.asarray([np.inf if (x := line["grad_norm"]) is None else x for line in steps])  # JSON has no infinity
+    clip, skip = config.optimizer.clip_norm, config.optimizer.skip_norm
     return {
-        "loss": float(np.mean([x for x in curve["loss"][-LAST:] if x is not None])),
-        "psnr": float(np.mean([x for x in curve["psnr"][-LAST:] if x is not None])),
+        "loss": mean("loss") / scale,
+        "psnr": mean("psnr"),
         "gradient": float(norms.max()),
-        "clipped": int(((norms > bounds[0]) & (norms <= bounds[1])).sum()),
+        "clipped": int(((norms > clip) & (norms <= skip)).sum()),
         "skipped": int(steps[-1]["skipped"]),
         "nonfinite": int(steps[-1]["nonfinite"]),
         "steps": len(steps),
         "events": dict(events),
-        "curve": curve,
-        "bounds": bounds,
     }
 
 

@@ -74,15 +74,6 @@ def test_results_of_a_readme_are_in_its_docs(page):
     assert TABLE in readme.read_text() and (page.parent / "results" / "x.json").exists()
 
 
-def test_rows_of_other_runs_stay(page):
-    publish(page, "x", TABLE, 1, row="a")
-    publish(page, "x", "| run | PSNR | name |\n|---|---:|---|\n| b | 3.0 | z |", 2, row="b")
-    publish(page, "x", "| error |\n|---|\n| 0 |", 3, row="c")
-    result = json.loads((page.parent / "results" / "x.json").read_text())
-    assert [block["rows"] for block in result["blocks"]] == [[["a", "1.0", "x"], ["b", "3.0", "z"]], [["0"]]]
-    assert result["numbers"] == {"a": 1, "b": 2, "c": 3}
-
-
 def test_what_differs_is_reported_and_rendered(page):
     (page.parents[1] / "README.md").write_text("")
     publish(page, "x", TABLE)
