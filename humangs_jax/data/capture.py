@@ -45,7 +45,7 @@ from humangs_jax.data.photos import (
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import contact_sheet, png_bytes, resized, write_png
+from humangs_jax.io.images import image_row, png_bytes, resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, check_limit, reading
 
@@ -82,7 +82,7 @@ class Capture:
 
     def _repr_png_(self) -> bytes:
         """The photos side by side, for notebooks."""
-        return png_bytes(contact_sheet(self.images))
+        return png_bytes(image_row(self.images))
 
     @property
     def view_count(self) -> int:

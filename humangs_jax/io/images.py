@@ -170,7 +170,7 @@ def png_bytes(image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], comp
     return file.getvalue()
 
 
-def contact_sheet(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:
+def image_row(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:
     """Images side by side, reduced to one height, pixels."""
     return np.concatenate([resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images], axis=1)
 

@@ -27,7 +27,7 @@ from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
-from humangs_jax.io.images import contact_sheet, named_color, png_bytes
+from humangs_jax.io.images import image_row, named_color, png_bytes
 from humangs_jax.rendering.compositing import FEATURE_COUNT, composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
@@ -77,7 +77,7 @@ class Rendering(Batchable):
     def _repr_png_(self) -> bytes:
         """The image, or those of a batch side by side, for notebooks."""
         images = np.asarray(self.rgb)
-        return png_bytes(contact_sheet(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
+        return png_bytes(image_row(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
 
 
 Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None
