@@ -18,6 +18,7 @@ from humangs_jax.io.arrays import check_array, check_checksum, check_indices, ch
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, Refused, parse_json, reading
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.harmonics import check_count
 
 FORMAT = "humangs-avatar"
 VERSION = 1
@@ -35,6 +36,8 @@ _ARRAYS = (
 ALIKE = 1e-3
 """Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
+_OPTIONAL = ("low_pass", "harmonics")
+"""Of the Gaussians."""
 
 
 @pytree_dataclass
@@ -114,8 +117,7 @@ class Avatar(Batchable):
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
         if self.light is not None:
             values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
-        if self.gaussians.low_pass is not None:
-            values["low_pass"] = self.gaussians.low_pass
+        values |= {name: x for name in _OPTIONAL if (x := getattr(self.gaussians, name)) is not None}
         values = {name: np.asarray(x if name == "faces" else at_least_float32(x)) for name, x in values.items()}
         with reading(path, "avatar"):
             _check_arrays(values, len(self.parents))
@@ -144,7 +146,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         raise Refused(f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}")
     with_light = any(f"light_{name}" in arrays for name in _LIGHT)
     wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
-    wanted += ("low_pass",) if "low_pass" in arrays else ()
+    wanted += tuple(name for name in _OPTIONAL if name in arrays)
     if missing := [name for name in wanted if name not in arrays]:
         raise Refused(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
@@ -158,7 +160,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     check_checksum(header.get("checksum"), checksum(arrays))
     loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
     return cls(
-        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), low_pass=loaded.get("low_pass")),
+        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), **{name: loaded.get(name) for name in _OPTIONAL}),
         *(loaded[name] for name in _ARRAYS[5:]),
         parents=tuple(header["parents"]),
         joint_names=tuple(header["joint_names"]),
@@ -187,6 +189,9 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:
         "rest_joints": (j, 3),
     }
     shapes |= {"light_coefficients": (TERMS,), "light_normals": (g, 3), "light_shading": (g,), "low_pass": (g,)}
+    if "harmonics" in arrays:
+        check_array("harmonics", arrays["harmonics"], (g, None, 3), -LARGEST, LARGEST)
+        check_count(arrays["harmonics"].shape[1])
     for name in arrays:
         if name in shapes:
             check_array(name, arrays[name], shapes[name], *ranges.get(name, (-LARGEST, LARGEST)))

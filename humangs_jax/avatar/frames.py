@@ -58,7 +58,8 @@ def draw(
     how = SPLAT_PRESETS[avatar.rendering] if how is None else how
     gaussians = (posed(avatar, pose) for pose in poses)
     if exposures is not None:
-        gaussians = (replace(g, colors=g.colors * e) for g, e in zip(gaussians, exposures, strict=True))
+        lit = lambda g, e: replace(g, **jax.tree.map(lambda x: x * e, {"colors": g.colors, "harmonics": g.harmonics}))
+        gaussians = (lit(g, e) for g, e in zip(gaussians, exposures, strict=True))
     return draw_gaussians(gaussians, cameras, background, how)
 
 

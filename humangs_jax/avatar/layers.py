@@ -171,7 +171,7 @@ def splatted(
     """Any numbers of Gaussians summed by the weights of their colors: splatting draws three channels at a time."""
     count = values.shape[1]
     triples = jnp.pad(values, ((0, 0), (0, -count % 3))).reshape(len(values), -1, 3)
-    each = (replace(gaussians, colors=triples[:, i]) for i in range(triples.shape[1]))
+    each = (replace(gaussians, colors=triples[:, i], harmonics=None) for i in range(triples.shape[1]))
     drawn = draw_gaussians(each, [camera] * triples.shape[1], jnp.zeros(3), how)
     return np.concatenate([np.asarray(rendering.rgb) for rendering in drawn], axis=-1)[..., :count]
 

@@ -83,14 +83,17 @@ PullBack = Callable[[Image], tuple[Parameters, Float[Array, " g"]]]
 
 
 def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
-    """Inverse of `gaussians_of`, as far as `unconstrain` is one; poses unchanged."""
+    """Inverse of `gaussians_of`, as far as `unconstrain` is one; poses unchanged. Raises: ValueError for harmonics."""
+    if gaussians.harmonics is not None:
+        raise ValueError("refine: gaussians.harmonics: expected none: colors that depend on the view are not refined")
     free = unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
-    return Parameters(**vars(free), rotations=jnp.zeros((views, joints, 3)), translations=jnp.zeros((views, 3)))
+    found = {name: x for name, x in vars(free).items() if x is not None}
+    return Parameters(**found, rotations=jnp.zeros((views, joints, 3)), translations=jnp.zeros((views, 3)))
 
 
 def gaussians_of(parameters: Parameters, low_pass: Float[Array, " g"] | None) -> Gaussians:
     """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
-    names = [field.name for field in dataclasses.fields(UnconstrainedGaussians)]
+    names = [field.name for field in dataclasses.fields(UnconstrainedGaussians) if hasattr(parameters, field.name)]
     gaussians = constrain(UnconstrainedGaussians(**{name: getattr(parameters, name) for name in names}))
     return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
 

@@ -16,6 +16,7 @@ from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.quaternion import left_singular_vectors
+from humangs_jax.rendering.harmonics import turned_harmonics
 from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D
 
 THINNEST = 1e-5
@@ -31,6 +32,9 @@ class Gaussians(Batchable):
     deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
     low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.animate`).
     Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what this makes larger in images of larger pixels.
+    harmonics: (g, k, 3) or None; spherical harmonics of degrees 1 (k = 3), 1 to 2 (8) or 1 to 3 (15) in the frame of the means:
+    what they add to the colors by the direction of sight, see `harmonics`. `skin_gaussians` turns them with the Gaussians, so
+    those of an avatar are in its T-pose.
     """
 
     means: Float[Array, "g 3"]
@@ -40,6 +44,7 @@ class Gaussians(Batchable):
     colors: Float[Array, "g 3"]
     deformations: Float[Array, "g 3 3"] | None = None
     low_pass: Float[Array, " g"] | None = None
+    harmonics: Float[Array, "g k 3"] | None = None
 
 
 def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
@@ -94,7 +99,8 @@ def factored(gaussians: Gaussians) -> Gaussians:
 def skin_gaussians(
     gaussians: Gaussians, transforms: Float[Array, "g 4 4"], mode: Literal["affine", "rotation"] = "affine"
 ) -> Gaussians:
-    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay.
+    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics turn with it: by the rotation
+    that the quaternion of the linear part stands for.
 
     affine: the covariance is transformed by the full linear part, which is appended to `deformations`.
     rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending
@@ -103,6 +109,9 @@ def skin_gaussians(
     Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations already.
     """
     linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
+    if gaussians.harmonics is not None:
+        turns = quaternion.to_matrix(quaternion.normalize(quaternion.from_matrix(linear)))
+        gaussians = replace(gaussians, harmonics=turned_harmonics(gaussians.harmonics, turns))
     if mode == "affine":
         deformations = linear
         if gaussians.deformations is not None:
@@ -129,6 +138,7 @@ class UnconstrainedGaussians(Batchable):
     """Parameters of Gaussians, or a batch of them, for optax.
 
     means: (g, 3) metres. quats: (g, 4), of any length. log_scales: (g, 3) of metres. opacity_logits: (g,). color_logits: (g, 3).
+    harmonics: (g, k, 3) or None, as they are.
     """
 
     means: Float[Array, "g 3"]
@@ -136,6 +146,7 @@ class UnconstrainedGaussians(Batchable):
     log_scales: Float[Array, "g 3"]
     opacity_logits: Float[Array, " g"]
     color_logits: Float[Array, "g 3"]
+    harmonics: Float[Array, "g k 3"] | None = None
 
 
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
@@ -157,6 +168,7 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
         jnp.log(jnp.maximum(gaussians.scales, SMALLEST_SCALE)),
         inverse_sigmoid(gaussians.opacities, OPACITY_MARGIN),
         inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
+        gaussians.harmonics,
     )
 
 
@@ -168,4 +180,5 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
         jnp.exp(parameters.log_scales),
         jax.nn.sigmoid(parameters.opacity_logits),
         jax.nn.sigmoid(parameters.color_logits),
+        harmonics=parameters.harmonics,
     )

@@ -33,6 +33,7 @@ from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_variance
+from humangs_jax.rendering.harmonics import added_colors
 from humangs_jax.rendering.splat_config import (
     DEFAULT_CONFIG,
     EPS2D,
@@ -52,6 +53,7 @@ class ProjectedGaussians(NamedTuple):
     x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
     determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
     finite where not drawn. visible: whether it is drawn. dimming: factor of the opacity in (0, 1], None without low-pass.
+    added_colors: what harmonics add to the colors from here, None without.
     """
 
     x: Float[Array, " g"]
@@ -66,10 +68,15 @@ class ProjectedGaussians(NamedTuple):
     r11: Float[Array, " g"]
     visible: Bool[Array, " g"]
     dimming: Float[Array, " g"] | None = None
+    added_colors: Float[Array, "g 3"] | None = None
 
     def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
         """Opacities as they are drawn."""
         return opacities if self.dimming is None else opacities * self.dimming
+
+    def seen_from_here(self, colors: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
+        """Colors as they are drawn."""
+        return colors if self.added_colors is None else jnp.maximum(colors + self.added_colors, 0.0)
 
     @property
     def means2d(self) -> Float[Array, "g 2"]:
@@ -125,6 +132,10 @@ def project(
     if gaussians.low_pass is not None and eps2d > 0:
         dimming = _dimming(m0, m1, determinant, eps2d, gaussians.low_pass * zx)
     r00, r01, r11 = _conic_factor(m0, m1, eps2d)
+    colors = None
+    if gaussians.harmonics is not None:
+        sight = [rotation[0, j] * u + rotation[1, j] * v + rotation[2, j] for j in range(3)]
+        colors = added_colors(gaussians.harmonics, *(lax.rsqrt(_dot(sight, sight)) * s for s in sight))
     return ProjectedGaussians(
         x=fx * u + cx,
         y=fy * v + cy,
@@ -138,6 +149,7 @@ def project(
         r11=r11,
         visible=in_front & small & (determinant > 0),
         dimming=dimming,
+        added_colors=colors,
     )
 
 

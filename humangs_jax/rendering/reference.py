@@ -10,6 +10,7 @@ time grow with Gaussians times pixels; use it in float64 on small images.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +68,14 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
 
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
     state = jnp.zeros((*blank.shape, 3), blank.dtype), blank, blank + 1, blank > 0
-    splats = centers, axes, determinants, depths, visible, opacities, gaussians.colors
+    colors = gaussians.colors
+    if gaussians.harmonics is not None:
+        sight = jnp.where(visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0)
+        sight = sight @ camera.cam_from_world[:3, :3]
+        sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
+        functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
+        colors = jnp.maximum(colors + jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics), 0)
+    splats = centers, axes, determinants, depths, visible, opacities, colors
     (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
     alpha = 1 - transmittance
     some = alpha > 0
@@ -100,6 +108,22 @@ def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple
     axes = product(image_from_world, covariance_factors(gaussians, config.normalize_quats))
     small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
     return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
+
+
+def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
+    """Real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m phi, sin m phi), by recurrence."""
+    x, y, z = sight.T
+    cosine, sine, found = jnp.ones_like(x), jnp.zeros_like(x), {}  # of m phi, times sin(theta)^m, which P leaves out
+    for m in range(degree + 1):
+        legendre = [0 * z, (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z]  # of degrees m - 1 and m
+        for n in range(m, degree + 1):
+            norm = (2 if m else 1) * (2 * n + 1) / (4 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
+            found[n, m], found[n, -m] = (
+                math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine)
+            )
+            legendre = [legendre[1], ((2 * n + 1) * z * legendre[1] - (n + m) * legendre[0]) / (n + 1 - m)]
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+    return jnp.stack([found[n, m] for n in range(1, degree + 1) for m in range(-n, n + 1)], axis=-1)
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:

@@ -1,7 +1,7 @@
 """Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad`.
 
 Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background. `reference` draws the same
-image by the definition. Gradients (reverse mode only) reach means, quats, scales, opacities, colors, deformations, the
+image by the definition. Gradients (reverse mode only) reach means, quats, scales, opacities, colors, harmonics, deformations, the
 background, and K and cam_from_world of the camera.
 
 Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of transformations measures
@@ -301,7 +301,7 @@ def _draw(
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
-    seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
+    seen = jnp.concatenate([projected.seen_from_here(gaussians.colors), behind[:, None]], axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
     features, transmittance, peaks, overflow = _draw_tiles(footprints, splats, grid, config)

@@ -60,6 +60,7 @@ class Packed:
     Little-endian; `low`, `high` and `step` are in the header:
         means uint16 (g, 3): from low to high, per axis, metres. scales uint16 (g, 3): log of metres, from low to high.
         quats int16 (g, 4): unit, wxyz, times 32767. opacities uint16 (g,): [0, 1]. colors uint16 (g, 3): from low to high.
+        harmonics uint16 (g, k, 3): from low to high; only if the Gaussians have some.
         weights uint16 (g, 8): skinning weights, the largest first; every row sums to 65535. weight_joints uint8 (g, 8).
         light_normals int8 (g, 3): times 127. light_shading uint16 (g,): from low to high. Both only if the avatar has a light.
         rest_joints float32 (j, 3): metres.
@@ -175,6 +176,9 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
     header["colors"], arrays["colors"] = _quantized(colors, min(colors.min(), 0.0), max(colors.max(), 1.0))
+    if g.harmonics is not None:
+        harmonics = np.asarray(g.harmonics, np.float64)
+        header["harmonics"], arrays["harmonics"] = _quantized(harmonics, harmonics.min(), harmonics.max())
     arrays["quats"] = np.rint(quats * 32767).astype("<i2")
     arrays["opacities"] = np.rint(opacities * STEPS).astype("<u2")
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))

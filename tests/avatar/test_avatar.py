@@ -44,8 +44,12 @@ def make_pose(seed=1):
     return BodyPose(jnp.asarray(rng.normal(size=(3, 3)), jnp.float32), jnp.asarray(rng.normal(size=3), jnp.float32))
 
 
-def test_save_and_load_are_exact(tmp_path):
+@pytest.mark.parametrize("functions", [0, 8])
+def test_save_and_load_are_exact(tmp_path, functions):
     avatar = make_avatar()
+    if functions:
+        harmonics = jnp.asarray(np.random.default_rng(1).normal(size=(12, functions, 3)), jnp.float32)
+        avatar = replace(avatar, gaussians=replace(avatar.gaussians, harmonics=harmonics))
     avatar.save(tmp_path / "a.npz")
     loaded = Avatar.load(tmp_path / "a.npz")
     assert jax.tree.structure(loaded) == jax.tree.structure(avatar)

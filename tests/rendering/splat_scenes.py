@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -28,6 +29,12 @@ def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
     deformations = np.eye(3) + 0.3 * rng.normal(size=(count, 3, 3))
     arrays = means, rng.normal(size=(count, 4)), scales, opacities, rng.uniform(0, 1, (count, 3)), deformations
     return Gaussians(*(jnp.asarray(a, dtype) for a in arrays))
+
+
+def with_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
+    """Some of the colors become negative from here, and are drawn as 0."""
+    values = np.random.default_rng(count).normal(size=(len(gaussians.means), count, 3))
+    return replace(gaussians, harmonics=jnp.asarray(values, gaussians.means.dtype))
 
 
 def camera(dtype=np.float64, width=WIDTH, height=HEIGHT) -> Camera:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rounding import bound
-from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
+from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, with_harmonics
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
@@ -84,11 +84,13 @@ def assert_close(ours, expected, tolerance):
     jax.tree_util.tree_map_with_path(check, ours, expected)
 
 
+@pytest.mark.parametrize("functions", [0, 15])
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**20))
-def test_equals_the_reference_with_all_gradients(seed):
+def test_equals_the_reference_with_all_gradients(seed, functions):
     with jax.enable_x64(True):
         gaussians = random_gaussians(seed)
+        gaussians = with_harmonics(gaussians, functions) if functions else gaussians
         ours, expected = (f(gaussians, camera(), background()) for f in (tiled, reference))
         assert_close(ours, expected, FLOAT64)
         assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(expected[1]))
@@ -316,9 +318,10 @@ def test_one_pixel():
         assert_close(render(gaussians, view), render_reference(gaussians, view), FLOAT64)
 
 
-@pytest.mark.parametrize("gradient", [False, True])
-def test_lowers_for_every_platform(gradient):
+@pytest.mark.parametrize(("gradient", "functions"), [(False, 0), (True, 0), (True, 15)])
+def test_lowers_for_every_platform(gradient, functions):
     gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
+    gaussians = with_harmonics(gaussians, functions) if functions else gaussians
     loss = lambda gaussians, view: jnp.sum(render(gaussians, view, CHUNKS).rgb)
     function = jax.grad(loss) if gradient else lambda gaussians, view: render(gaussians, view, CHUNKS).rgb
     exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)

@@ -16,6 +16,7 @@ from experiments import chromium
 from experiments import page as evaluation
 from experiments.subjects import shipped_person
 from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, RestBody, joint_transforms
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform
 from humangs_jax.viewer.page import page_server, write_page
@@ -63,6 +64,18 @@ def test_nine_views_are_those_of_render(browser, avatar):
     assert len(scores) == 9
     for view, (whole, person) in scores.items():
         assert whole > WHOLE and person > PERSON, (view, whole, person)
+
+
+def test_so_are_those_of_an_avatar_with_harmonics(avatar, tmp_path):
+    values = 0.15 * np.random.default_rng(0).normal(size=(len(avatar.gaussians.means), 15, 3))
+    gaussians = replace(avatar.gaussians, harmonics=jnp.asarray(values, jnp.float32))
+    colored = replace(avatar, gaussians=gaussians)
+    write_page(tmp_path / "avatar.html", colored)
+    with chromium.Chromium() as browser:
+        browser.open(tmp_path / "avatar.html")
+        for view, (whole, person) in evaluation.view_scores(browser, colored, SIZE).items():
+            assert whole > WHOLE - 3 and person > PERSON - 3, (view, whole, person)
+        assert browser.problems() == []
 
 
 def test_so_is_its_own_image_after_a_hundred_frames_of_motion(browser, avatar):

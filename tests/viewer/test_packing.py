@@ -57,6 +57,16 @@ def test_what_the_page_reads_is_the_avatar(seed):
     assert np.abs(got["weights"] - double(avatar.skinning_weights)).max() <= 3 * STEP
 
 
+def test_harmonics_are_kept():
+    avatar = small_avatar()
+    harmonics = np.random.default_rng(0).normal(size=(len(avatar.gaussians.means), 8, 3))
+    gaussians = replace(avatar.gaussians, harmonics=jnp.asarray(harmonics, jnp.float32))
+    packed = packing.pack(replace(avatar, gaussians=gaussians))
+    low, high = packed.header["harmonics"]["low"], packed.header["harmonics"]["high"]
+    got = low + packing.unpack(packed)["harmonics"] * STEP * (high - low)
+    assert got.shape == harmonics.shape and np.abs(got - harmonics).max() <= HALF * STEP * (high - low) + 1e-6
+
+
 def test_the_light_is_kept():
     avatar, rng = small_avatar(), np.random.default_rng(0)
     normals = rng.normal(size=avatar.gaussians.means.shape)

@@ -122,6 +122,8 @@ def plain_arrays(
     bounded = {
         f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in ("means", "quats", "scales", "colors")
     }
+    if gaussians.harmonics is not None:
+        raise ValueError("export: gaussians.harmonics: expected none: these files hold one color for each Gaussian")
     check_values("export", gaussian_values(gaussians))
     check_values("export", bounded)
     gaussians = replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)

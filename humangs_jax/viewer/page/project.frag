@@ -11,6 +11,9 @@ uniform usampler2D order;      // nearest first
 uniform int count;
 uniform usampler2D gaussians;  // three texels each, see scene.js
 uniform sampler2D means;       // canonical, metres; the normal in 24 bits
+uniform sampler2D harmonics;   // canonical: humangs_jax/rendering/harmonics.py; blocks of `rows`, one for each function
+uniform int functions;         // 0: none
+uniform int rows;
 layout(std140) uniform Joints {
   vec4 joints[3 * 256];        // three rows of [linear | offset] per joint
 };
@@ -59,6 +62,18 @@ vec4 quat_of(mat3 t) {
   return q / (2.0 * max(best, 0.1));
 }
 
+void add_harmonics(inout vec3 rgb, vec3 d, ivec2 place) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, ring = 4.0 * zz - xx - yy;
+  float values[15] = float[15](
+    -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
+    1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (2.0 * zz - xx - yy), -1.09254843 * x * z, 0.54627422 * (xx - yy),
+    -0.59004359 * y * (3.0 * xx - yy), 2.89061144 * x * y * z, -0.45704580 * y * ring,
+    0.37317633 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -0.45704580 * x * ring, 1.44530572 * z * (xx - yy),
+    -0.59004359 * x * (xx - 3.0 * yy));
+  for (int f = 0; f < functions; f++) rgb += values[f] * texelFetch(harmonics, place + ivec2(0, f * rows), 0).rgb;
+  rgb = max(rgb, 0.0);
+}
+
 void main() {
   placed = shape = color = uvec4(0u);                // no extent: not drawn
   ivec2 slot = ivec2(gl_FragCoord.xy);
@@ -98,6 +113,9 @@ void main() {
   float change = dot(first_light, normal) + dot(more_light, normal * normal.yzx) - shading
                + dot(last_light, vec2(normal.z * normal.z - normal.x * normal.x, 3.0 * normal.y * normal.y - 1.0));
   rgb = min(rgb * exp(clamp(change, -LIGHT_LIMIT, LIGHT_LIMIT)), max(rgb, 1.0));
+
+  if (functions > 0)           // the direction of sight, turned back into the T-pose
+    add_harmonics(rgb, normalize(p) * camera_rotation * matrix_of(normalize(quat_of(linear))), ivec2(column, row));
 
   mat3 turned = matrix_of(quat);
   turned = rotation_only ? matrix_of(quat_of(linear * turned)) : linear * turned;

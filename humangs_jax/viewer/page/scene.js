@@ -77,6 +77,17 @@ function meanTexels(scene) {
   return { data: out, width: ROW, height };
 }
 
+// What is added by direction: for each function of the sphere a block of rows like those of the means.
+function harmonicTexels(scene) {
+  const { harmonics } = scene.arrays, rows = Math.ceil(scene.count / ROW), { low, high } = scene.header.harmonics;
+  const functions = harmonics.length / (3 * scene.count), out = new Float32Array(4 * ROW * rows * functions);
+  for (let i = 0; i < scene.count; i++)
+    for (let f = 0; f < functions; f++)
+      for (let c = 0; c < 3; c++)
+        out[4 * (f * rows * ROW + i) + c] = low + (harmonics[3 * (functions * i + f) + c] / 65535) * (high - low);
+  return { data: out, width: ROW, height: rows * functions };
+}
+
 // Moves canonical means and joints for shape coefficients. The Gaussians of a vertex move with it and keep their sizes.
 function applyShape(scene, betas) {
   const { shape } = scene.header, directions = scene.arrays.shape_directions, joints = scene.arrays.shape_joints;

@@ -18,6 +18,8 @@ function makeRenderer(canvas, scene) {
 
   const gaussians = makeTexture(gl, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussianTexels(scene));
   const means = makeTexture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, meanTexels(scene));
+  const harmonics = scene.arrays.harmonics ? makeTexture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, harmonicTexels(scene)) : null;
+  const functions = harmonics ? scene.arrays.harmonics.length / (3 * count) : 0;
   const joints = gl.createBuffer();
   gl.bindBuffer(gl.UNIFORM_BUFFER, joints);
   gl.bufferData(gl.UNIFORM_BUFFER, 16 * 3 * MOST_JOINTS, gl.DYNAMIC_DRAW);
@@ -63,11 +65,11 @@ function makeRenderer(canvas, scene) {
     fitImage(width, height);
 
     gl.useProgram(project.program);
-    [order, gaussians, means].forEach((texture, unit) => bind(gl, unit, texture));
+    [order, gaussians, means, harmonics ?? means].forEach((texture, unit) => bind(gl, unit, texture));
     gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, joints);
     gl.bufferSubData(gl.UNIFORM_BUFFER, 0, rows);
     project.set({
-      order: 0, gaussians: 1, means: 2, count, camera_rotation: camera.rotation, camera_offset: camera.translation, K: camera.K,
+      order: 0, gaussians: 1, means: 2, harmonics: 3, functions, rows: splatRows, count, camera_rotation: camera.rotation, camera_offset: camera.translation, K: camera.K,
       size: [width, height], log_scale: [header.scales.low, header.scales.high],
       color_range: [header.colors.low, header.colors.high], near: how.near, eps2d: how.eps2d, low_pass: how.low_pass, alpha_min: how.alpha_min,
       first_light: light.slice(0, 3), more_light: light.slice(3, 6), last_light: light.slice(6), shading_range: [shading.low, shading.high],
