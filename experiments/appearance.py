@@ -67,8 +67,9 @@ def appearance(
 
     def measure(seed):
         row: dict[str, Any] = {}
+        person = functools.cache(lambda size: make_evaluation_subject(seed, start.body, (VIEWS,), size, start.held_out))
         for size, wrong in itertools.product(sizes, off):
-            subject = with_body_off(make_evaluation_subject(seed, start.body, (VIEWS,), size, start.held_out), wrong)
+            subject = with_body_off(person(size), wrong)
             still = subject.held_out.select(task_views(subject.held_out)["novel"])
             drawn = {name: _drawn(start, subject.inputs(VIEWS), still, **VARIANTS[name]) for name in variants}
             row[f"{size} {wrong:g}"] = {name: scores_of(*images, still, networks) for name, images in drawn.items()}

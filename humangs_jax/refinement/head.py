@@ -50,11 +50,14 @@ PARTS = 10
 
 
 class Crops(NamedTuple):
-    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show. views: the crops."""
+    """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show. views: the crops. finer: whether
+    these have smaller pixels than the other steps have seen.
+    """
 
     moved: Bool[np.ndarray, " g"]
     drawn: Int[np.ndarray, " d"]
     views: SubjectViews
+    finer: bool
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
@@ -63,15 +66,22 @@ def shows_heads(capture: Capture, config: RefineConfig) -> bool:
     return min(longest, config.image_size or longest) >= LEAST_SIDE
 
 
-def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock) -> Avatar:
-    """The avatar after `config.head_steps` steps on its head. trust: see `RefineState`. avatar: with the low-pass of photos."""
-    photos, count = photos_of(crops.views), config.head_steps
-    settings = dataclasses.replace(config, **HOST_SETTINGS)
+def sharpened(
+    avatar: Avatar, trust: Float[Array, " g"], capture: Capture, config: RefineConfig, clock: Clock
+) -> Avatar | None:
+    """The avatar after `config.head_steps` steps on its head; None if no photo shows one.
+
+    avatar: with the low-pass of the photos. trust: see `RefineState`. capture: of usable views. 0 steps compile all.
+    """
+    count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
     with clock.compiling():
-        drawn = with_low_pass_of(avatar.select(crops.drawn), crops.views)
+        if (crops := head_crops(avatar, capture, config.image_size)) is None:
+            return None
+        photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
+        drawn = with_low_pass_of(drawn, crops.views) if crops.finer else drawn
         parameters = parameters_of(drawn.gaussians, len(photos.index), len(drawn.parents))
         share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
-        splat = planned(drawn, crops.views)
+        splat = planned(avatar, crops.views)  # by programs that there are already
         splat = dataclasses.replace(splat, visibility=False, **{x: _power(getattr(splat, x)) for x in BUFFERS})
         state = started(parameters, share, settings, splat)
         state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(()))
@@ -135,9 +145,9 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     size = min(longest, image_size or longest)
     views = crop_to_person(capture, size)
     middles, side = _squares(_pixels(avatar, views)[:, sure])
-    wanted = min(longest, round(size * LARGEST_HEAD / side))
+    finer, wanted = False, min(longest, round(size * LARGEST_HEAD / side))
     if not 1 / SIMILAR < wanted / size < SIMILAR:
-        views = crop_to_person(capture, wanted)
+        finer, views = wanted > size, crop_to_person(capture, wanted)
         middles, side = _squares(_pixels(avatar, views)[:, sure])
     seen = np.flatnonzero(((middles >= 0) & (middles < views.masks.shape[1:])).all(axis=1))
     if not len(seen):
@@ -151,7 +161,7 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     views = replace(views, images=images, masks=masks, cameras=cameras)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
-    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))]), views)
+    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))]), views, finer)
 
 
 def _power(number: int) -> int:

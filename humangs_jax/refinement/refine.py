@@ -6,6 +6,7 @@ what `search` finds until its time is over.
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -18,7 +19,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.usable_views import unusable_views
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.head import head_crops, sharpened, shows_heads
+from humangs_jax.refinement.head import sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of
 from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.refinement.search import Clock, comparison, prepare, search
@@ -123,7 +124,12 @@ def refine_with_report(
     clock = Clock(config, progress)
     with clock.compiling():
         task, best, each = prepare(avatar, views, config, clock)
-    interrupted = False
+    unlimited, usable = config.seconds is None or config.steps == 0, _usable(capture)
+    heads, interrupted = bool(config.head_steps) and unlimited and shows_heads(capture, config), False
+    compiler = ThreadPoolExecutor(1)
+    if heads:  # beside the programs of the search
+        own = dataclasses.replace(config, head_steps=0, iterations=1)
+        compiler.submit(sharpened, task.avatar, best.state.trust, capture.select(usable), own, Clock(own))
     try:
         for found in search(task, best, each):
             best = found if found.kept else best
@@ -136,31 +142,29 @@ def refine_with_report(
     after = comparison(task, best.state.parameters, fitted, best.state.splat).together()
     kept = bool(after.loss < before.loss)
     after = after if kept else before
-    result, crops = avatar_of(best.state.parameters, task.avatar) if kept else avatar, None
-    unlimited = config.seconds is None or config.steps == 0
-    if config.head_steps and unlimited and not interrupted and shows_heads(capture, config):
+    result, sharp = avatar_of(best.state.parameters, task.avatar) if kept else avatar, None
+    if heads and not interrupted:
         try:
             with clock.compiling():
+                compiler.shutdown()
                 begin = with_low_pass_of(result, views)
-                crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config.image_size)
-            if crops is not None:
-                result = sharpened(begin, best.state.trust, crops, config, clock)
+            sharp = sharpened(begin, best.state.trust, capture.select(usable[best.used]), config, clock)
         except KeyboardInterrupt:
-            crops, interrupted = None, True
+            interrupted = True
     seconds = clock.stopped()
     return Refinement(
-        result,
+        result if sharp is None else sharp,
         best.iterations,
         clock.done,
         seconds,
         clock.compile_seconds,
         loss=(float(before.loss), float(after.loss)),
         psnr=(float(before.psnr), float(after.psnr)),
-        kept=kept or crops is not None,
+        kept=kept or sharp is not None,
         interrupted=interrupted,
         planned=None if interrupted or clock.late else clock.planned,
-        left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
-        head_steps=0 if crops is None else config.head_steps,
+        left_out=_without(capture, usable, best.used) if len(best.used) < len(task.photos) else (),
+        head_steps=0 if sharp is None else config.head_steps,
     )
 
 
@@ -174,9 +178,9 @@ def _check(avatar: Avatar, capture: Capture) -> None:
         raise ValueError(f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
 
 
-def _without(capture: Capture, used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
+def _without(capture: Capture, usable: Int[np.ndarray, " v"], used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
     """Names of the usable views that are not among these."""
-    return tuple(capture.names[view] for i, view in enumerate(_usable(capture)) if i not in used)
+    return tuple(capture.names[view] for i, view in enumerate(usable) if i not in used)
 
 
 def _usable(capture: Capture) -> Int[np.ndarray, " n"]:
