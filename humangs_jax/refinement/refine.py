@@ -124,10 +124,11 @@ def refine_with_report(
     clock = Clock(config, progress)
     with clock.compiling():
         task, best, each = prepare(avatar, views, config, clock)
-    unlimited, usable = config.seconds is None or config.steps == 0, _usable(capture)
+    unlimited = config.seconds is None or config.steps == 0
     heads, interrupted = bool(config.head_steps) and unlimited and shows_heads(capture, config), False
-    compiler = ThreadPoolExecutor(1)
+    compiler, usable = ThreadPoolExecutor(1), np.arange(0)
     if heads:  # beside the programs of the search
+        usable = _usable(capture)
         own = dataclasses.replace(config, head_steps=0, iterations=1)
         compiler.submit(sharpened, task.avatar, best.state.trust, capture.select(usable), own, Clock(own))
     try:
@@ -163,7 +164,7 @@ def refine_with_report(
         kept=kept or sharp is not None,
         interrupted=interrupted,
         planned=None if interrupted or clock.late else clock.planned,
-        left_out=_without(capture, usable, best.used) if len(best.used) < len(task.photos) else (),
+        left_out=_without(capture, best.used) if len(best.used) < len(task.photos) else (),
         head_steps=0 if sharp is None else config.head_steps,
     )
 
@@ -178,9 +179,9 @@ def _check(avatar: Avatar, capture: Capture) -> None:
         raise ValueError(f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
 
 
-def _without(capture: Capture, usable: Int[np.ndarray, " v"], used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
+def _without(capture: Capture, used: Int[np.ndarray, " n"]) -> tuple[str, ...]:
     """Names of the usable views that are not among these."""
-    return tuple(capture.names[view] for i, view in enumerate(usable) if i not in used)
+    return tuple(capture.names[view] for i, view in enumerate(_usable(capture)) if i not in used)
 
 
 def _usable(capture: Capture) -> Int[np.ndarray, " n"]:
