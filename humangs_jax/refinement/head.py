@@ -51,13 +51,14 @@ PARTS = 10
 
 class Crops(NamedTuple):
     """moved: (g,) the Gaussians of the head. drawn: the numbers of those that the crops show. views: the crops. finer: whether
-    these have smaller pixels than the other steps have seen.
+    these have smaller pixels than the other steps have seen. splat: how they are drawn, with buffers.
     """
 
     moved: Bool[np.ndarray, " g"]
     drawn: Int[np.ndarray, " d"]
     views: SubjectViews
     finer: bool
+    splat: SplatConfig
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
@@ -66,24 +67,18 @@ def shows_heads(capture: Capture, config: RefineConfig) -> bool:
     return min(longest, config.image_size or longest) >= LEAST_SIDE
 
 
-def sharpened(
-    avatar: Avatar, trust: Float[Array, " g"], capture: Capture, config: RefineConfig, clock: Clock
-) -> Avatar | None:
-    """The avatar after `config.head_steps` steps on its head; None if no photo shows one.
+def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock) -> Avatar:
+    """The avatar after `config.head_steps` steps on its head; 0 steps compile all that others need.
 
-    avatar: with the low-pass of the photos. trust: see `RefineState`. capture: of usable views. 0 steps compile all.
+    avatar: with the low-pass of the photos. trust: see `RefineState`.
     """
     count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
     with clock.compiling():
-        if (crops := head_crops(avatar, capture, config.image_size)) is None:
-            return None
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
         drawn = with_low_pass_of(drawn, crops.views) if crops.finer else drawn
         parameters = parameters_of(drawn.gaussians, len(photos.index), len(drawn.parents))
         share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
-        splat = planned(avatar, crops.views)  # by programs that there are already
-        splat = dataclasses.replace(splat, visibility=False, **{x: _power(getattr(splat, x)) for x in BUFFERS})
-        state = started(parameters, share, settings, splat)
+        state = started(parameters, share, settings, crops.splat)
         state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(()))
         state = _advanced(state, 0, photos, drawn, settings, clock)
     for part in range(1, PARTS + 1):
@@ -161,7 +156,10 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     views = replace(views, images=images, masks=masks, cameras=cameras)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved
-    return Crops(moved, np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))]), views, finer)
+    drawn = np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))])
+    splat = planned(avatar, views)  # of all Gaussians, by programs that there are already
+    buffers = {name: _power(getattr(splat, name)) for name in BUFFERS}
+    return Crops(moved, drawn, views, finer, dataclasses.replace(splat, visibility=False, **buffers))
 
 
 def _power(number: int) -> int:

@@ -19,7 +19,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.usable_views import unusable_views
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.head import sharpened, shows_heads
+from humangs_jax.refinement.head import head_crops, sharpened, shows_heads
 from humangs_jax.refinement.objective import avatar_of
 from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.refinement.search import Clock, comparison, prepare, search
@@ -126,11 +126,13 @@ def refine_with_report(
         task, best, each = prepare(avatar, views, config, clock)
     unlimited = config.seconds is None or config.steps == 0
     heads, interrupted = bool(config.head_steps) and unlimited and shows_heads(capture, config), False
-    compiler, usable = ThreadPoolExecutor(1), np.arange(0)
-    if heads:  # beside the programs of the search
-        usable = _usable(capture)
-        own = dataclasses.replace(config, head_steps=0, iterations=1)
-        compiler.submit(sharpened, task.avatar, best.state.trust, capture.select(usable), own, Clock(own))
+    compiler, crops = ThreadPoolExecutor(1), None
+    if heads:
+        with clock.compiling():
+            crops = head_crops(task.avatar, capture.select(_usable(capture)), config.image_size)
+        if crops is not None:  # beside the programs of the search
+            own = dataclasses.replace(config, head_steps=0, iterations=1)
+            compiler.submit(sharpened, task.avatar, best.state.trust, crops, own, Clock(own))
     try:
         for found in search(task, best, each):
             best = found if found.kept else best
@@ -144,12 +146,14 @@ def refine_with_report(
     kept = bool(after.loss < before.loss)
     after = after if kept else before
     result, sharp = avatar_of(best.state.parameters, task.avatar) if kept else avatar, None
-    if heads and not interrupted:
+    if crops is not None and not interrupted:
         try:
             with clock.compiling():
                 compiler.shutdown()
                 begin = with_low_pass_of(result, views)
-            sharp = sharpened(begin, best.state.trust, capture.select(usable[best.used]), config, clock)
+                if len(best.used) < len(task.photos):
+                    crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config.image_size)
+            sharp = None if crops is None else sharpened(begin, best.state.trust, crops, config, clock)
         except KeyboardInterrupt:
             interrupted = True
     seconds = clock.stopped()
