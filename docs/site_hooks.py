@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 
 COMMANDS = "<!-- commands -->"
 """Where docs/cli.md gets the help of every command."""
@@ -29,5 +30,6 @@ def commands() -> str:
 def help_of(*command: str) -> str:
     """What `humangs COMMAND --help` prints, without colors."""
     run = [sys.executable, "-m", "humangs_jax.cli", *command, "--help"]
-    environment = os.environ | {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "120"}
-    return subprocess.run(run, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+    environment = os.environ | {"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "86"}
+    text = subprocess.run(run, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+    return "\n".join(textwrap.fill(line, 86) if line[:1].isalpha() else line for line in text.split("\n"))

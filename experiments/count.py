@@ -130,7 +130,7 @@ def documented(root: Path) -> str:
         for function in ast.parse(file.read_text()).body:
             if isinstance(function, ast.FunctionDef) and function.name in names:
                 text, taken = ast.get_docstring(function) or "", function.args
-                wanted = ["Args:"] * bool(taken.args or taken.kwonlyargs or taken.kwarg) + ["Example:"]
+                wanted = ["Args:"] * bool(taken.args or taken.kwonlyargs or taken.kwarg) + ["Examples:"]
                 returned = function.returns
                 wanted += ["Returns:"] * (returned is not None and ast.unparse(returned) != "None")
                 every += 1

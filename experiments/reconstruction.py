@@ -22,6 +22,7 @@ from experiments.subjects import shipped_person
 from experiments.timing import medians
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.frames import draw_gaussians
+from humangs_jax.avatar.reconstruct import reconstruct_views, stack_captures
 from humangs_jax.body.model import pose_body, shape_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -30,7 +31,7 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
 from humangs_jax.network.presets import PRESETS
-from humangs_jax.network.weights import expected_variables
+from humangs_jax.network.weights import expected_variables, load_weights
 from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
 from humangs_jax.rendering.splatting import round_up
 
@@ -214,3 +215,27 @@ def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), subject)
     program, _, flops = whole(expected_variables(config), shapes, config)
     return {"temporary_mb": temporary_mb(program), "flops": flops}
+
+
+@entry
+def reconstruction_batches(run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32), runs: int = 3) -> None:
+    """Subjects a second of `hg.reconstruct_views` under `vmap`, by the size of the batch: four photos, shipped weights.
+
+    Options:
+        sizes: of the batches
+        runs: timed calls of each, in turns; the median counts
+    """
+    (variables, config), capture = load_weights(), load_capture(DEMO_CAPTURE)
+    batched = jax.jit(jax.vmap(reconstruct_views, in_axes=(None, None, None, 0)))
+    calls, memory = {}, {}
+    for size in sizes:
+        body, views, own = stack_captures(config, [capture] * size)
+        program = batched.lower(variables, own, body, views).compile()
+        memory[str(size)] = temporary_mb(program)
+        arguments = variables, own, body, views
+        calls[str(size)] = lambda program=program, arguments=arguments: jax.block_until_ready(program(*arguments))
+    each = {size: float(ms[0]) / int(size) for size, ms in medians(calls, runs).items()}
+    first = each[str(sizes[0])]
+    rows = [[size, f"{1000 / ms:.2f}", f"{first / ms:.2f}", f"{memory[size]:,.0f}"] for size, ms in each.items()]
+    header = ["subjects in a batch", "subjects a second", f"relative to {sizes[0]}", "working memory, MB"]
+    run.show(markdown_table(header, rows, "rrrr"), {"ms": each, "memory_mb": memory})

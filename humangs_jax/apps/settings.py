@@ -148,8 +148,8 @@ def reconstruct_with(
     Raises:
         ValueError: as `reconstruct` and `refine`.
 
-    Example:
-        avatar = hg.reconstruct_with("quality", *hg.load_weights(), capture)
+    Examples:
+        >>> avatar = hg.reconstruct_with("quality", *hg.load_weights(), capture)
     """
     if isinstance(settings, str):
         if settings not in PRESETS:
@@ -350,9 +350,9 @@ def tune(
         NoSettingError: if no setting is within the budget; it says what the cheapest takes.
         ValueError: if memory is limited where it cannot be measured.
 
-    Example:
-        tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
-        avatar = hg.reconstruct_with(tuned.point.settings, *hg.load_weights(), capture)
+    Examples:
+        >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
+        >>> avatar = hg.reconstruct_with(tuned.point.settings, *hg.load_weights(), capture)
     """
     budget = Budget(reconstruct_ms, frame_ms, memory_mb)
     front = usable(load_front() if front is None else front, capture)

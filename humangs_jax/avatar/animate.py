@@ -32,9 +32,9 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     Returns:
         Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a light.
 
-    Example:
-        loss = lambda pose: jnp.mean((hg.render(hg.skin(avatar, pose), camera, config).rgb - photo) ** 2)
-        gradient = jax.grad(loss)(pose)
+    Examples:
+        >>> loss = lambda pose: jnp.mean((hg.render(hg.skin(avatar, pose), camera, config).rgb - photo) ** 2)
+        >>> gradient = jax.grad(loss)(pose)
     """
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
@@ -61,8 +61,8 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         ValueError: if the pose has another number of joints than the avatar; outside of transformations, also for values
             that are not finite or out of range, naming the array.
 
-    Example:
-        image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
+    Examples:
+        >>> image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
     """
     joints = len(avatar.parents)
     if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):

@@ -47,9 +47,9 @@ class Avatar(Batchable):
     Or a batch of people, leading axes on every array: it can be indexed and iterated over, and functions are mapped over it with
     `jax.vmap`.
 
-    Example:
-        avatar = hg.Avatar.load("avatar.npz")
-        image = hg.render(hg.animate(avatar, pose), camera).rgb
+    Examples:
+        >>> avatar = hg.Avatar.load("avatar.npz")
+        >>> image = hg.render(hg.animate(avatar, pose), camera).rgb
     """
 
     gaussians: Gaussians

@@ -69,8 +69,8 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
         ValueError: if the network makes no Gaussians, the capture has no view, none that shows the person, or values that
             are not finite or out of range, naming the array.
 
-    Example:
-        avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
+    Examples:
+        >>> avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
@@ -102,8 +102,8 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
         ValueError: if there is no capture, one has no view or values that are not finite or out of range, or their bodies
             differ.
 
-    Example:
-        avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
+    Examples:
+        >>> avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
     """
     body, views, config, turned = _stacked(config, captures)
     avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
@@ -126,10 +126,10 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
         ValueError: as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the avatars are to have the
             light of their photos: in a batch all have one or none has.
 
-    Example:
-        body, views, config = hg.stack_captures(config, captures)
-        batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
-        avatars, dropped = batched(variables, config, body, views)  # `reconstruct_batch`, as one batch
+    Examples:
+        >>> body, views, config = hg.stack_captures(config, captures)
+        >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
+        >>> avatars, dropped = batched(variables, config, body, views)  # `reconstruct_batch`, as one batch
     """
     body, views, config, turned = _stacked(config, captures)
     if config.conventions.light and any(turned):
@@ -214,8 +214,8 @@ def reconstruct_views(
     Raises:
         ValueError: if the body is not the one that this configuration wants, or the photos are not of its size.
 
-    Example:
-        avatars, dropped = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
+    Examples:
+        >>> avatars, dropped = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
     """
     made = "body, views, config = stack_captures(config, captures) makes what it wants"
     (height, width), side = views.images.shape[1:3], config.image_size

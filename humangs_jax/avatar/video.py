@@ -83,9 +83,9 @@ def write_video(
             is another one or has no alpha.
         OSError: if the file cannot be written; also what `frames` raises.
 
-    Example:
-        images = (hg.render(hg.animate(avatar, pose), camera).rgb for pose in poses)
-        hg.write_video("dance.mp4", map(np.asarray, images), fps=30)
+    Examples:
+        >>> images = (hg.render(hg.animate(avatar, pose), camera).rgb for pose in poses)
+        >>> hg.write_video("dance.mp4", map(np.asarray, images), fps=30)
     """
     path = Path(path)
     if not (np.isfinite(fps) and fps > 0):

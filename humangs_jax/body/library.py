@@ -54,8 +54,8 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         ValueError: naming file and key, for what cannot be read.
         TypeError: for options of SMPL-X files given with another body.
 
-    Example:
-        body = hg.load_body("SMPLX_NEUTRAL.npz")
+    Examples:
+        >>> body = hg.load_body("SMPLX_NEUTRAL.npz")
     """
     if path is None:
         if smplx_options:

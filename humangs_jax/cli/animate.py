@@ -30,7 +30,7 @@ FROM_THE_SIDE = Shot(azimuth=20.0)
 
 @dataclasses.dataclass(frozen=True)
 class Animate:
-    """Animate an avatar with a motion: a video, or a folder of PNG files.
+    """Animate an avatar with a motion: a video or PNG files.
 
     The camera goes along with the person. Files of motions: docs: motions.
     """
@@ -89,7 +89,7 @@ class Animate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, or from the cameras of a capture.
+    """Render an avatar from a circle of cameras, or those of a capture.
 
     As images, as layers of an EXR file, or as a video of one turn (docs: video).
     """
@@ -177,9 +177,10 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Show an avatar moving in the browser, or what a running training or refinement makes.
+    """Show an avatar moving in the browser.
 
-    Serves the HTML viewer on this machine until Ctrl-C (docs: viewer).
+    Or, with --live, what a running training or refinement makes. Serves the HTML viewer on this machine until Ctrl-C.
+    docs: viewer.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

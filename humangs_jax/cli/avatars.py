@@ -41,7 +41,10 @@ _USUAL_UP = (
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Try everything on the shipped person: reconstruct, refine, render new views, animate."""
+    """Try everything on the shipped person.
+
+    Reconstructs, refines, renders held-out views, animates, and writes the avatar.
+    """
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs demo --out demo_out",
@@ -75,10 +78,11 @@ class Demo:
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruct:
-    """Reconstruct avatars from capture folders: photos, cameras, body poses.
+    """Reconstruct avatars from capture folders.
 
-    Several captures, or a folder of them, become OUT/NAME.npz. Those that are there are kept, so that the same command goes on
-    after an interruption; a capture that fails does not stop the others. docs: capture_format.
+    A capture is photos, cameras and body poses. Several captures, or a folder of them, become OUT/NAME.npz. Those that are
+    there are kept, so that the same command goes on after an interruption; a capture that fails does not stop the others.
+    docs: capture_format.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -190,9 +194,9 @@ class Reconstruct:
 
 @dataclasses.dataclass(frozen=True)
 class Refine:
-    """Fit an avatar to the photos of a capture: learned-optimizer iterations, then gradient descent.
+    """Fit an avatar to the photos of a capture.
 
-    Ctrl-C ends it early; the best avatar until then is written.
+    By learned-optimizer iterations, then gradient descent. Ctrl-C ends it early; the best avatar until then is written.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -303,7 +307,7 @@ def _save(avatar: "Avatar", out: Path, how: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Export an avatar: Gaussians or a textured mesh for other programs, or an HTML viewer.
+    """Export Gaussians, a textured mesh, or an HTML viewer.
 
     In the T-pose, in one frame of a motion, or in many. Programs and formats: docs: export.
     """
@@ -412,10 +416,10 @@ class Export:
 
 @dataclasses.dataclass(frozen=True)
 class Tune:
-    """Find the best settings within a budget of time or memory, measured on this machine.
+    """Find the best settings within a budget of time or memory.
 
-    The result is for --config of `reconstruct`, `animate`, `render`. Times are without compilation. The exit code is 1, and
-    nothing is written, if no setting is within the budget. The settings that are tried: docs: tradeoff.
+    They are measured on this machine. The result is for --config of `reconstruct`, `animate`, `render`. Times are without
+    compilation. The exit code is 1, and nothing is written, if no setting is within the budget. docs: tradeoff.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

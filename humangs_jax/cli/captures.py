@@ -45,7 +45,7 @@ def found_here(capture: Path, person: int | None) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Detect:
-    """Find the person in photos: 33 keypoints and a mask for each photo.
+    """Find the person in photos: keypoints and masks.
 
     people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs: your_photos.
     """
@@ -83,7 +83,7 @@ SIZES = (128, 256, 512)
 
 @dataclasses.dataclass(frozen=True)
 class ImportCameras:
-    """Make a capture folder from photos and the calibration of their cameras.
+    """Make a capture folder from photos and calibrated cameras.
 
     Then `humangs fit` finds the body. Conventions of every format: docs: cameras.
     """

@@ -72,7 +72,7 @@ WAYS: dict[Way, set[str]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Find the body in photos with cameras, or in a scan; or refine a body by masks.
+    """Find the body in photos with cameras, or in a scan.
 
     With CAPTURE: shape and poses from 2D keypoints of --keypoints, or of the shipped detector. With CAPTURE --refine: better
     cameras and poses from masks. With --scan: the body in a mesh. docs: fitting.
@@ -249,7 +249,7 @@ class Fit:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Draw the body over each photo of a capture, and name what looks wrong.
+    """Draw the body over each photo, and name what looks wrong.
 
     For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """

@@ -40,9 +40,9 @@ class ScanViews:
 
 @dataclasses.dataclass(frozen=True)
 class Preprocess:
-    """Turn a data set into photos with cameras and bodies, by the published protocol.
+    """Turn a data set into photos with cameras and bodies.
 
-    Can be interrupted and resumed. Layouts, licences, and lines for SLURM: docs: datasets.
+    By the published protocol. Can be interrupted and resumed. Layouts, licences, and lines for SLURM: docs: datasets.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

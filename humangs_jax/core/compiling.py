@@ -34,8 +34,8 @@ def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None
         The folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
         cannot be written to is not an error.
 
-    Example:
-        hg.enable_compile_cache()
+    Examples:
+        >>> hg.enable_compile_cache()
     """
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
@@ -110,8 +110,8 @@ def compiler_options() -> dict[str, Any] | None:
     Returns:
         `CPU_COMPILER_OPTIONS` if the default backend is the CPU, else None.
 
-    Example:
-        step = jax.jit(step, compiler_options=hg.compiler_options())
+    Examples:
+        >>> step = jax.jit(step, compiler_options=hg.compiler_options())
     """
     import jax
 

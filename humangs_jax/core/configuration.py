@@ -233,8 +233,8 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
     Raises:
         ValueError: naming the path, for a field that does not exist, and as the configuration's own checks.
 
-    Example:
-        hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})
+    Examples:
+        >>> hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})
     """
     for path, value in changes.items():
         config = _varied(config, path.split("."), value, path)

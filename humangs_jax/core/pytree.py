@@ -193,8 +193,8 @@ def replace(tree: T, **changes: Any) -> T:
     Raises:
         TypeError: for a name that is no field.
 
-    Example:
-        grey = hg.replace(gaussians, colors=jnp.full_like(gaussians.colors, 0.5))
+    Examples:
+        >>> grey = hg.replace(gaussians, colors=jnp.full_like(gaussians.colors, 0.5))
     """
     names = {f.name for f in dataclasses.fields(tree)}  # ty: ignore[invalid-argument-type]
     if unknown := set(changes) - names:

@@ -161,8 +161,8 @@ def capture_from_arrays(
     Raises:
         CaptureError: one line that names the array and what was expected: a shape, finite numbers, a range.
 
-    Example:
-        capture = hg.capture_from_arrays(photos, K, cam_from_world, rotations, translations, masks=masks)
+    Examples:
+        >>> capture = hg.capture_from_arrays(photos, K, cam_from_world, rotations, translations, masks=masks)
     """
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
@@ -220,9 +220,9 @@ def load_capture(
     Raises:
         CaptureError: for whatever is wrong in the folder, one line with file and field.
 
-    Example:
-        capture = hg.load_capture("demo_capture")
-        photos, camera = capture.images, capture.cameras[0]
+    Examples:
+        >>> capture = hg.load_capture("demo_capture")
+        >>> photos, camera = capture.images, capture.cameras[0]
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
@@ -254,8 +254,8 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
         CaptureError: if the capture is not valid, or `path` is a folder with something in it (with `overwrite`: with
             something else than a capture).
 
-    Example:
-        hg.save_capture("me", capture)
+    Examples:
+        >>> hg.save_capture("me", capture)
     """
     path = Path(path)
     _check_before_writing(capture)

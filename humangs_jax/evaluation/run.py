@@ -284,8 +284,8 @@ def evaluate(
         ValueError: one line: unknown protocol, nothing to compare, sizes that differ.
         OSError: for files that cannot be read.
 
-    Example:
-        hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
+    Examples:
+        >>> hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
     """
     rules = find_protocol(protocol)
     networks = {network.net: network for network in lpips}

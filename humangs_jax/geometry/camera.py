@@ -30,8 +30,8 @@ class Camera(Batchable):
 
     A batch can be indexed and iterated over: `for camera in cameras`.
 
-    Example:
-        camera = hg.Camera.from_opencv(K, cam_from_world, width=512, height=512)
+    Examples:
+        >>> camera = hg.Camera.from_opencv(K, cam_from_world, width=512, height=512)
     """
 
     K: Matrix3
@@ -160,8 +160,8 @@ def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, 
     Returns:
         One camera.
 
-    Example:
-        camera = hg.look_at(jnp.array([0.0, 1.0, 3.0]), jnp.array([0.0, 0.9, 0.0]), jnp.array([0.0, 1.0, 0.0]), K, 512, 512)
+    Examples:
+        >>> camera = hg.look_at(jnp.array([0.0, 1.0, 3.0]), jnp.array([0.0, 0.9, 0.0]), jnp.array([0.0, 1.0, 0.0]), K, 512, 512)
     """
     forward = safe_normalize(target - eye, jnp.asarray([0.0, 0.0, 1.0]))
     right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
@@ -197,8 +197,8 @@ def orbit(
     Raises:
         ValueError: for elevations beyond a right angle.
 
-    Example:
-        cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
+    Examples:
+        >>> cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):

@@ -114,8 +114,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}; a part without parameters or
         running statistics is absent.
 
-    Example:
-        variables = hg.init_humangs(jax.random.key(0), config)
+    Examples:
+        >>> variables = hg.init_humangs(jax.random.key(0), config)
     """
     run, parts = config.run(), config.architecture
     encoder_key, decoder_key = jax.random.split(key)

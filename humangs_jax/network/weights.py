@@ -58,8 +58,8 @@ def save_weights(
     Raises:
         ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or overflows float16.
 
-    Example:
-        hg.save_weights("mine.safetensors", variables, config, "float16")
+    Examples:
+        >>> hg.save_weights("mine.safetensors", variables, config, "float16")
     """
     from safetensors.numpy import save
 
@@ -89,8 +89,8 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
         ValueError: naming file and key: no weights file of this package; a tensor is missing, unknown, of the wrong shape
             or not finite; the contents are not those of the checksum.
 
-    Example:
-        variables, config = hg.load_weights()
+    Examples:
+        >>> variables, config = hg.load_weights()
     """
     if path is None:
         with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:

@@ -154,11 +154,11 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
     A low-pass is no parameter: it stays in the scales. Raises: ValueError for Gaussians with deformations.
 
-    Example:
-        parameters = hg.unconstrain(gaussians)
-        loss = lambda p: jnp.mean(jnp.square(hg.render(hg.constrain(p), camera, config).rgb - photo))
-        updates, state = optimizer.update(jax.grad(loss)(parameters), state)
-        parameters = optax.apply_updates(parameters, updates)
+    Examples:
+        >>> parameters = hg.unconstrain(gaussians)
+        >>> loss = lambda p: jnp.mean(jnp.square(hg.render(hg.constrain(p), camera, config).rgb - photo))
+        >>> updates, state = optimizer.update(jax.grad(loss)(parameters), state)
+        >>> parameters = optax.apply_updates(parameters, updates)
     """
     if gaussians.deformations is not None:
         raise ValueError("unconstrain: the Gaussians carry deformations: take rendering.gaussians.factored(gaussians)")

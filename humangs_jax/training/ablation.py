@@ -83,7 +83,7 @@ class Ablation:
             color = "tab:blue" if row.clear else "0.6"
             axis.errorbar(row.difference, place, xerr=row.interval, fmt="o", color=color, capsize=3)
         axis.axvline(0, color="black", linewidth=0.8)
-        axis.set(yticks=range(len(rows)), yticklabels=[row.name for row in rows])
+        axis.set(yticks=range(len(rows)), yticklabels=[row.name for row in rows], ylim=(-0.6, len(rows) - 0.4))
         axis.set_xlabel(f"change of {self.metric}, with {CONFIDENCE:.0%} intervals by paired seeds")
         return figure
 
@@ -128,9 +128,9 @@ def ablate(
             folder with runs of other settings.
         TrainingInterrupted: after Ctrl-C; what is trained is kept.
 
-    Example:
-        result = hg.ablate("tiny", {"no class token": {"model.architecture.encoder.transformer.class_token": False}})
-        result.plot()
+    Examples:
+        >>> result = hg.ablate("tiny", {"no class token": {"model.architecture.encoder.transformer.class_token": False}})
+        >>> result.plot()
     """
     if BASE in variants:
         raise ArgumentError("variants", f"{BASE!r}: is the name of the run that variants are compared with")

@@ -272,8 +272,8 @@ def train(
             divide each other, or the sizes of a later stage do not fit.
         OSError: if another process trains into `out`.
 
-    Example:
-        state = hg.train(config, hg.load_body(), ["people/0000001", "people/0000002"], "runs/mine")
+    Examples:
+        >>> state = hg.train(config, hg.load_body(), ["people/0000001", "people/0000002"], "runs/mine")
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)

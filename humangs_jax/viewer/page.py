@@ -310,8 +310,8 @@ def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> Not
     Raises:
         ValueError: as `page_html`.
 
-    Example:
-        hg.show(avatar, hg.load_motion("dance.bvh"))
+    Examples:
+        >>> hg.show(avatar, hg.load_motion("dance.bvh"))
     """
     return NotebookPage(page_html(avatar, motion), height)
 

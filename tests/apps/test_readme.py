@@ -29,7 +29,7 @@ def test_the_blocks_of_the_readme_run():
     assert -10 * np.log10(np.mean(error**2)) > LEAST_PSNR
     assert len(names["gaussians"].means) == len(names["avatar"].gaussians.means)
     assert float(np.abs(names["gradient"].colors).max()) > 0
-    assert names["ablation"] != names["base"]
+    assert names["ablation"] != names["config"]
 
 
 def test_the_readme_is_short():
