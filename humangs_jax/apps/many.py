@@ -3,13 +3,14 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
-import jax
-
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct, reconstruct_batch
 from humangs_jax.core.array_types import PyTree
 from humangs_jax.data.capture import Capture
 from humangs_jax.network.config import HumanGSConfig
+
+BATCH = 8
+"""Beyond it memory grows, and little else."""
 
 
 class Reconstructed(NamedTuple):
@@ -27,9 +28,9 @@ def reconstruct_many(
     """Yields the avatar of each capture, in their order; `batch` captures at a time are read and reconstructed by one `vmap`.
 
     Arguments: captures: functions that load one each, by its name; ValueError and OSError that they raise are yielded.
-    batch: None for 1 on a CPU, which gains nothing by more, else 8.
+    batch: None for `BATCH`.
     """
-    names, batch = list(captures), batch or (1 if jax.default_backend() == "cpu" else 8)
+    names, batch = list(captures), batch or BATCH
     for start in range(0, len(names), batch):
         done = [_loaded(name, captures[name]) for name in names[start : start + batch]]
         good = [each.capture for each in done if each.capture is not None]

@@ -88,7 +88,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
 def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
 
-    A batch keeps an accelerator busy that one person does not; on a CPU it takes as long as one person after the other.
+    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.

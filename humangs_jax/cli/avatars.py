@@ -108,7 +108,7 @@ class Reconstruct:
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
     batch: Annotated[int | None, at_least(1)] = None
-    """Captures that the network reads at once. Default: 1 on a CPU, else 8."""
+    """Captures that the network reads at once. Default: 8."""
     shard: str = "0/1"
     """I/N: the I-th of N parts of the captures, counted from 0, for job arrays."""
     fit_masks: bool = True
