@@ -54,6 +54,11 @@ MARGIN = 0.12
 """Around the person, of its height."""
 
 
+Points = Float[np.ndarray, "n 3"]
+Faces = Int[np.ndarray, "f 3"]
+PerVertex = Float[np.ndarray, " n"]
+
+
 @dataclasses.dataclass(frozen=True)
 class _View:
     """One photo: the window around the person. mask: signed distance to the edge, pixels. project: (3, 4) to the window's pixels.
@@ -108,7 +113,7 @@ def displacement(
     return total.astype(np.float32)
 
 
-def _views(body: BodyModel, rest: Float[np.ndarray, "n 3"], capture: Capture) -> list[_View]:
+def _views(body: BodyModel, rest: Points, capture: Capture) -> list[_View]:
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
     unusable = unusable_views(capture)
@@ -137,7 +142,7 @@ def _window(
     mask: Float[np.ndarray, "h w"],
     project: Float[np.ndarray, "3 4"],
     linear: Float[np.ndarray, "n 3 3"],
-    offset: Float[np.ndarray, "n 3"],
+    offset: Points,
 ) -> _View:
     """A view, cut to the person and brought to one size. Beyond the border of the photo the mask goes on as it ends there."""
     (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
@@ -165,12 +170,8 @@ def _share_outside(views: list[_View], rest: Float[np.ndarray, "n 3"], free: Boo
 
 
 def _targets(
-    views: list[_View],
-    rest: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "f 3"],
-    inset: tuple[float, float],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    views: list[_View], rest: Points, normals: Points, faces: Faces, inset: tuple[float, float]
+) -> tuple[PerVertex, PerVertex]:
     """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-INWARDS, OUTWARDS + STEP / 2, STEP)
@@ -212,9 +213,7 @@ def _crossing(
     return distance, found
 
 
-def _silhouette(
-    pixels: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"], shape: tuple[int, ...]
-) -> Float[np.ndarray, "h w"]:
+def _silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
     """1 where the body is, in a window."""
     triangles = pixels[faces]
     a, b, c = np.moveaxis(triangles, 1, 0)
@@ -226,13 +225,7 @@ def _silhouette(
     return np.asarray(image, np.float32)
 
 
-def _spread(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "f 3"],
-    count: Float[np.ndarray, " n"],
-    summed: Float[np.ndarray, " n"],
-    held: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
+def _spread(vertices: Points, faces: Faces, count: PerVertex, summed: PerVertex, held: PerVertex) -> PerVertex:
     """The smooth displacement that is nearest to the targets."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
@@ -241,9 +234,7 @@ def _spread(
     return np.clip(splu(matrix.tocsc()).solve(areas * summed), -INWARDS, OUTWARDS)
 
 
-def _laplacian(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
-) -> sparse.csr_array | sparse.csr_matrix:
+def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_matrix:
     """By the cotangents of the angles, none of them negative."""
     rows, columns, values = [], [], []
     for i in range(3):
@@ -260,12 +251,12 @@ def _laplacian(
 
 def _outside(
     views: list[_View],
-    rest: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "f 3"],
+    rest: Points,
+    normals: Points,
+    faces: Faces,
     inset: tuple[float, float],
     free: Bool[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
+) -> PerVertex:
     """How far each vertex moves inwards until all masks contain it, smoothly."""
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)

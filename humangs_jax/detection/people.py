@@ -15,15 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.detection.blazepose import (
-    LANDMARK_SIZE,
-    Crop,
-    Detection,
-    Landmarks,
-    Networks,
-    mask_at,
-    mask_in_photo,
-)
+from humangs_jax.detection.blazepose import LANDMARK_SIZE, Crop, Detection, Landmarks, Networks, mask_at, mask_in_photo
 from humangs_jax.io.images import resized
 
 SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)

@@ -27,11 +27,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_image
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
-from humangs_jax.network.reader import (
-    photo_colors,
-    project_vertices,
-    visible_vertices,
-)
+from humangs_jax.network.reader import photo_colors, project_vertices, visible_vertices
 from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 

@@ -19,14 +19,7 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import mirrored_name
-from humangs_jax.fitting.person_bundle import (
-    Evidence,
-    Rig,
-    adjust,
-    align_views,
-    pixel_errors,
-    place_person,
-)
+from humangs_jax.fitting.person_bundle import Evidence, Rig, adjust, align_views, pixel_errors, place_person
 from humangs_jax.fitting.residuals.keypoints import NOISE, OPTICAL_AXIS, OUTER
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import smallest_turns

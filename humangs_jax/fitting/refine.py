@@ -422,10 +422,7 @@ class RefinedCapture:
 
 
 def refine_capture(
-    capture: Capture,
-    *,
-    keypoints: Keypoints | None = None,
-    config: CaptureRefineConfig = DEFAULT_CONFIG,
+    capture: Capture, *, keypoints: Keypoints | None = None, config: CaptureRefineConfig = DEFAULT_CONFIG
 ) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 

@@ -298,11 +298,7 @@ def _other_side(name: str) -> str:
 
 
 def search(
-    scan: Scan,
-    whole: ScanProblem,
-    tolerances: Tolerances,
-    given: Callable[[Similarity], Given],
-    effective: float,
+    scan: Scan, whole: ScanProblem, tolerances: Tolerances, given: Callable[[Similarity], Given], effective: float
 ) -> tuple[Start, FitState]:
     """The best start, and the body after its coarse iterations, with all joints of `whole` free.
 

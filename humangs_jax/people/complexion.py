@@ -18,6 +18,8 @@ HAIR = {
     "grey": (0.1, 0.05, (0.3, 0.66)), "dyed": ((0, 1), 0.55, 0.55),
 }  # fmt: skip
 """Hue, saturation and value of hair, or their ranges."""
+Face = tuple[Field, Field, Field, Points]
+"""Distances from the middle, heights, how far in front they are in [0, 1], and the points."""
 FAIR_ODDS, DARK_ODDS = np.asarray([[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0.12, 0.01, 0.0, 0.03, 0.03]])
 """Odds of the colors of hair above, of fair and of dark skin."""
 
@@ -107,9 +109,9 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
         result = _tinted(result, (0.96, 0.82, 0.8), 0.5 * (knees + elbows))
         i = np.flatnonzero((y > 0.19) & (z > -0.14) & (x < 0.2))
         face = x[i], y[i], np.clip((z[i] - 0.07) / 0.02, 0, 1), s.template[i]
-        result[i] = _cheeks_and_eyes(tones, features, result[i], *face, seed)
-        result[i] = _aged(tones, result[i], *face[:3])
-        result[i] = _mouth_and_brows(tones, haircut, features, result[i], *face, seed)
+        result[i] = _cheeks_and_eyes(tones, features, result[i], face, seed)
+        result[i] = _aged(tones, result[i], face)
+        result[i] = _mouth_and_brows(tones, haircut, features, result[i], face, seed)
         return result
 
     return Material(albedo, wrinkles=0.0, sheen=0.25)
@@ -132,17 +134,9 @@ def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
     return _tinted(mix(result, pale, 0.55 * palm), (0.98, 0.82, 0.8), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
 
 
-def _cheeks_and_eyes(
-    tones: Complexion,
-    features: Mapping[str, float],
-    result: Points,
-    x: Field,
-    y: Field,
-    front: Field,
-    template: Points,
-    seed: int,
-) -> Points:
+def _cheeks_and_eyes(tones: Complexion, features: Mapping[str, float], result: Points, face: Face, seed: int) -> Points:
     """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
+    x, y, front, template = face
     cheeks = _bell((x, 0.043, 0.02), (y, 0.292, 0.018))
     nose = 0.7 * _bell((x, 0, 0.012 * features["nose"]), (y, 0.295, 0.012))
     result = _tinted(result, (1.02, 0.82, 0.80), 0.6 * front * np.clip(cheeks + nose, 0, 1))
@@ -163,10 +157,11 @@ def _cheeks_and_eyes(
     return mix(result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1))
 
 
-def _aged(tones: Complexion, result: Points, x: Field, y: Field, front: Field) -> Points:
+def _aged(tones: Complexion, result: Points, face: Face) -> Points:
     """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
     if tones.wrinkles <= 0:
         return result
+    x, y, front, _ = face
     fold = np.abs(x - 0.0165 - 0.55 * (0.287 - y)) + 10 * (np.abs(y - 0.272) > 0.018)
     forehead = 0.55 * band(np.abs(((y - 0.368 + 0.8 * x * x) / 0.0085) % 1 - 0.5) * 0.0085, -1, 0.0008)
     forehead = forehead * band(y, 0.36, 0.392, 0.006) * (x < 0.045)
@@ -178,17 +173,10 @@ def _aged(tones: Complexion, result: Points, x: Field, y: Field, front: Field) -
 
 
 def _mouth_and_brows(
-    tones: Complexion,
-    haircut: Haircut,
-    features: Mapping[str, float],
-    result: Points,
-    x: Field,
-    y: Field,
-    front: Field,
-    template: Points,
-    seed: int,
+    tones: Complexion, haircut: Haircut, features: Mapping[str, float], result: Points, face: Face, seed: int
 ) -> Points:
     """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows there."""
+    x, y, front, template = face
     width, ahead = 0.026 * features["lip_width"], template[:, 2] > 0.08
     corner = np.clip(1 - (x / width) ** 2, 0, 1)
     bow = 0.009 * features["lip_fullness"] * corner * (1 - 0.35 * _bell((x, 0, 0.005)))

@@ -32,13 +32,7 @@ from humangs_jax.training.augmentation import Augmentation
 logger = logging.getLogger(__name__)
 Below = Annotated[float, Range(0, 0.999_999)]
 """Of a running mean that forgets."""
-HOST_SETTINGS = {
-    "seed": 0,
-    "log_every": 1,
-    "validate_every": 1,
-    "checkpoint_every": 1,
-    "keep_checkpoints": 1,
-}
+HOST_SETTINGS = {"seed": 0, "log_every": 1, "validate_every": 1, "checkpoint_every": 1, "keep_checkpoints": 1}
 """Settings of a run that no compiled program depends on, with the values that programs are compiled for."""
 
 

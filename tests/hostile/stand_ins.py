@@ -176,10 +176,7 @@ def stand_ins(variant):
 
     def shown(vertices, faces, tints, camera):
         image = random_of(variant, 3).random((camera.height, camera.width))
-        return SimpleNamespace(
-            shaded=np.repeat(image[..., None], 3, -1),
-            covered=image > 0.5,
-        )
+        return SimpleNamespace(shaded=np.repeat(image[..., None], 3, -1), covered=image > 0.5)
 
     def in_scan(*_, **__):
         model = load_body()

@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 from rounding import bound
 
-from humangs_jax.losses.losses import (
-    FAR_SURFACE,
-    ray_spread,
-    squared_error,
-    surface_distance,
-    tightness,
-    translucency,
-)
+from humangs_jax.losses.losses import FAR_SURFACE, ray_spread, squared_error, surface_distance, tightness, translucency
 from humangs_jax.losses.metrics import (
     BOUNDARY,
     LARGEST_PSNR,

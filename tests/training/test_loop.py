@@ -147,11 +147,7 @@ def test_what_was_dropped_is_explained(body, captures, variables, tmp_path, monk
 def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypatch):
     batch = stage_loader(captured_people(captures, body), CONFIG, 0).batch_at(0)
     asked = []
-    monkeypatch.setattr(
-        step,
-        "compiled_update",
-        lambda: lambda *given: asked.append(given[-3:]) or (given[0], {}),
-    )
+    monkeypatch.setattr(step, "compiled_update", lambda: lambda *given: asked.append(given[-3:]) or (given[0], {}))
     for config in (CONFIG, dataclasses.replace(CONFIG, seed=7, log_every=9, keep_checkpoints=5)):
         train_step(init_state(config, variables), batch, body, config)
     assert asked[0][1:] == asked[1][1:] and hash(asked[0][1]) == hash(asked[1][1])

@@ -62,9 +62,7 @@ NOTHING_TO_SEE = {
     "all inputs": lambda batch: replace(batch, inputs=without_person(batch.inputs, slice(None))),
     "all targets": lambda batch: replace(batch, targets=without_person(batch.targets, slice(None))),
     "everything": lambda batch: replace(
-        batch,
-        inputs=without_person(batch.inputs, slice(None)),
-        targets=without_person(batch.targets, slice(None)),
+        batch, inputs=without_person(batch.inputs, slice(None)), targets=without_person(batch.targets, slice(None))
     ),
 }
 
@@ -139,8 +137,7 @@ def test_gaussians_of_no_size_and_of_any(body, batch, variables, log_scale):
 
 def decoder_of(**changes):
     return dataclasses.replace(
-        CONFIG,
-        model=CONFIG.model.with_parts(decoder=dataclasses.replace(CONFIG.model.architecture.decoder, **changes)),
+        CONFIG, model=CONFIG.model.with_parts(decoder=dataclasses.replace(CONFIG.model.architecture.decoder, **changes))
     )
 
 

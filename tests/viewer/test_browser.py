@@ -21,10 +21,7 @@ from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform
 from humangs_jax.viewer.page import page_server, write_page
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing())),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))]
 
 WHOLE, PERSON = 55.0, 48.0
 """dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10 log10(12 255^2) = 58.9 where
@@ -309,10 +306,7 @@ BAD_FILES = {
         "not an npz archive, or cut short",
     ),
     "keys.npz": (npz(joints=np.zeros((2, 3))), "expected one of the keys rotations, smpl_poses, poses"),
-    "width.npz": (
-        npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30),
-        "poses: expected frames of 165 or 156",
-    ),
+    "width.npz": (npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30), "poses: expected frames of 165 or 156"),
     "nan.npz": (
         npz(poses=np.full((2, 66), np.nan), trans=np.zeros((2, 3)), fps=30),
         "key poses: expected finite numbers",

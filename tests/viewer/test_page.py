@@ -133,10 +133,7 @@ def test_export_of_a_page_writes_nothing_else(avatar_file, tmp_path, monkeypatch
     [
         (("export", "me.npz", "--html", "p.txt"), r"--html p\.txt: expected a name ending in \.html"),
         (("export", "me.npz", "--html", "no/p.html"), r"--html no/p\.html: the folder no does not exist"),
-        (
-            ("export", "me.npz", "--html", "p.html", "--motion", "walk52.npz"),
-            "rotations: expected 3 joints, got 52",
-        ),
+        (("export", "me.npz", "--html", "p.html", "--motion", "walk52.npz"), "rotations: expected 3 joints, got 52"),
         (("view", "nobody.npz"), r"nobody\.npz: no such file"),
         (("view", "me.npz", "--port", "99999"), "--port 99999"),
     ],
