@@ -59,7 +59,7 @@ def made(folder: Path, split: Any) -> Path:
 
 
 def on_validation(folder: Path, count: int) -> dict[str, float]:
-    """Scores of the views on which `bench.score` compares variants: drawn as `training.validation` draws them."""
+    """Scores of the views on which `bench.score` compares variants: drawn as `training.forward` draws them."""
     folders, rows = find_captures(folder)[:VALIDATED], []
     cache = CaptureCache(folders, load_capture(folders[0]).body)
     sampling = ViewSampling((count,), target_count=TARGETS, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)

@@ -32,9 +32,9 @@ from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
+from humangs_jax.training.forward import validate, validation_examples
 from humangs_jax.training.loop import TrainingInterrupted, train
 from humangs_jax.training.sources import cached_people
-from humangs_jax.training.validation import validate, validation_examples
 
 PAGE = REPOSITORY / "docs" / "paper.md"
 SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}

@@ -42,11 +42,11 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig, compiled_for
+from humangs_jax.training.forward import sheet, validate, validation_examples
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import seed_numbers, train_step, update
-from humangs_jax.training.validation import sheet, validate, validation_examples
 
 logger = logging.getLogger("humangs_jax.training")
 FLUSH_SECONDS = 10

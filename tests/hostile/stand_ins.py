@@ -47,7 +47,7 @@ from humangs_jax.refinement.refine import Refinement
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training import config
-from humangs_jax.training.validation import METRICS
+from humangs_jax.training.forward import METRICS
 
 HEAVY = (
     *("apps.check", "apps.demo", "apps.settings", "avatar.frames", "avatar.layers", "avatar.video"),

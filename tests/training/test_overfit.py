@@ -22,9 +22,9 @@ from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.people.writer import Layout, write_person
 from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
+from humangs_jax.training.forward import evaluate
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
-from humangs_jax.training.validation import evaluate
 
 OPTIMIZED = True  # hundreds of steps
 SIZE, STEPS = 128, 280

@@ -16,7 +16,7 @@ from humangs_jax.data.views import gaussian_body, standardize
 from humangs_jax.evaluation.cases import Case
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.network.weights import load_weights
-from humangs_jax.training import validation
+from humangs_jax.training import forward
 from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig, tiny
 from humangs_jax.training.loop import train
 from humangs_jax.training.state import init_state
@@ -62,7 +62,7 @@ def test_one_person_is_learnt_and_shown_by_the_evaluator(name, body, captures):
     assert errors[-1] < errors[0] / FALL
     assert ("silhouette" in metrics) == ("tightness" in metrics) == (name in DRIVEN)
 
-    _, numbers = validation.evaluate(state.variables, mapped, Example(views, views), config)
+    _, numbers = forward.evaluate(state.variables, mapped, Example(views, views), config)
     scored = evaluate(Case("tube", chosen, chosen), weights=(state.variables, config.model))
     assert scored.means["psnr"].mean == pytest.approx(float(numbers["psnr"]), abs=0.05)
     assert np.isnan(numbers["semi_transparent"]) == (scored.means["iou"] is None) == (name in PIXELS)

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from humangs_jax.training.config import tiny
+from humangs_jax.training.forward import sheet, validation_examples
 from humangs_jax.training.sources import captured_people
-from humangs_jax.training.validation import sheet, validation_examples
 
 CONFIG = dataclasses.replace(tiny(), views=dataclasses.replace(tiny().views, input_counts=(3, 1, 2)))
 

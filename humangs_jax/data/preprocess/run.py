@@ -52,6 +52,7 @@ from humangs_jax.data.preprocess.protocol import (
     TEST,
     TRAIN,
     VIEWS,
+    ScanRenderer,
     bounding_radius,
     evaluation_indices,
     intrinsics,
@@ -61,7 +62,6 @@ from humangs_jax.data.preprocess.protocol import (
     split_ids,
     video_alignment,
 )
-from humangs_jax.data.preprocess.rendering import ScanRenderer
 from humangs_jax.data.sets import DATA_SET, begin_set, finished, made, write_manifest
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png

@@ -30,7 +30,7 @@ from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.formats import DATASETS, DataSetFormat
 from humangs_jax.data.loading import find_captures
 from humangs_jax.data.preprocess import run as set_run
-from humangs_jax.data.preprocess.rendering import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
+from humangs_jax.data.preprocess.protocol import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
 from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.io import atomic
 from humangs_jax.io.images import read_image

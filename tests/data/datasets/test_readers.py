@@ -33,8 +33,8 @@ from humangs_jax.evaluation.run import evaluate
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import write_json
 from humangs_jax.training.config import tiny
+from humangs_jax.training.forward import validation_examples
 from humangs_jax.training.sources import people_on_disk, training_people
-from humangs_jax.training.validation import validation_examples
 
 FLOAT32 = 1e-6
 JPEG = 3
