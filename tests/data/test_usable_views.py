@@ -11,7 +11,7 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.usable_views import shares_on_masks, usable_indices, usable_views
+from humangs_jax.data.usable_views import _sampling, shares_on_masks, usable_indices, usable_views
 from humangs_jax.data.views import select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
 
@@ -79,6 +79,15 @@ def test_without_masks_all_views_are_kept(demo):
 
 def test_exact_masks_hold_the_body(demo):
     assert min(shares_on_masks(demo)) > 0.95
+
+
+def test_points_are_spread_by_the_area_of_the_skin():
+    vertices, corners = np.zeros((6, 3)), np.asarray([[0, 1, 2], [3, 4, 5]])
+    vertices[[1, 2, 4, 5], [0, 1, 0, 1]], vertices[3:, 2] = [3, 3, 1, 1], 1.0  # areas 9 : 1
+    found, weights = _sampling(vertices, corners, 1000)
+    assert np.mean(found[:, 0] == 0) == pytest.approx(0.9, abs=0.01)
+    points = np.einsum("pc,pcx->px", weights, vertices[found])[found[:, 0] == 0]
+    np.testing.assert_allclose(points.mean(axis=0), [1, 1, 0], atol=0.1)  # the centroid
 
 
 def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):
