@@ -19,7 +19,7 @@ from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPI
 from humangs_jax.fitting import landmark_fit
 from humangs_jax.fitting.fit_capture import fit_uncertainty
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks
-from humangs_jax.fitting.residuals.keypoints import PLACE_STD, group_by_frame, world_residuals
+from humangs_jax.fitting.residuals.keypoints import PLACE_STD, group_by_frame, keypoint_residuals, world_residuals
 from humangs_jax.fitting.state import pose_prior, violations
 
 CONFIG = FitConfig()
@@ -112,6 +112,13 @@ def test_a_frame_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_
     usual = pose_prior(model_of().joint_names).mean
     np.testing.assert_allclose(np.asarray(fit.poses.rotations)[2, 1:], usual[1:], atol=1e-3)
     assert not np.allclose(np.asarray(whole.poses.rotations)[2, 1:], usual[1:], atol=0.1)
+
+
+def test_a_confidence_of_a_quarter_is_a_quarter_of_the_cost():
+    seen = jax.tree.map(lambda leaf: leaf[0], observe(NAMES[:1])[2])
+    cost = lambda seen: np.square(keypoint_residuals(model_of(), seen, jnp.ones((133, 3)), 5.0)).sum()
+    quarter = replace(seen, confidences=seen.confidences / 4)
+    assert 0 < cost(quarter) == pytest.approx(cost(seen) / 4, rel=1e-5)
 
 
 def test_nothing_seen_at_all_is_finite(noisy):

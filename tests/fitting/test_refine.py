@@ -366,3 +366,8 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
     assert cost(4.0, 4.0) < 0.02 * cost(4.0, 0.0)
     assert cost(-4.0, 0.0) > 1.5 * cost(4.0, 0.0)
     assert cost(4.0, 0.0) < 40 * 4.0**2, "180 equations count for 40"
+
+
+def test_clothes_inside_the_body_count_more_than_those_outside():
+    inside, outside = module._counted(jnp.asarray([-0.5, 0.5]))
+    assert -inside > 3 * outside == 1.5

@@ -31,6 +31,7 @@ from humangs_jax.fitting.state import (
     camera_origin,
     cameras_of,
     clothing_thickness,
+    limit_residuals,
     pose_of,
     pose_prior,
     segments,
@@ -214,6 +215,15 @@ def test_what_no_joint_does_is_found(joint, vector, axis):
     found = violations(PRIOR, rotations)
     assert [(k, a) for k, a, _ in found] == [(j, axis)]
     assert found[0][2] > 0.3
+
+
+@pytest.mark.parametrize("limit", ["lower", "upper"])
+def test_three_degrees_beyond_a_limit_count_as_much_as_one_deviation(limit):
+    joints, side = tuple(range(1, len(JOINT_NAMES))), {"lower": -1, "upper": 1}[limit]
+    turned = lambda degrees: jnp.asarray(getattr(PRIOR, limit) + side * np.deg2rad(degrees), jnp.float32)
+    residuals = lambda degrees: limit_residuals(PRIOR, joints, turned(degrees))
+    np.testing.assert_allclose(residuals(3.0), 1.0, atol=0.1)
+    np.testing.assert_allclose(residuals(0.0), 0.0, atol=1e-5)
 
 
 def test_unknown_joints_rest_freely():

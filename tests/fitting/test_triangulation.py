@@ -61,6 +61,20 @@ def test_what_no_two_views_agree_on_is_unknown():
     assert np.isfinite(weights).all()
 
 
+def test_of_noisy_points_the_pixels_errors_are_least():
+    """Cameras of several focal lengths: no other point in space has smaller squared errors."""
+    _, seen = scene(views=4)
+    one, scale = jax.tree.map(lambda leaf: leaf[0], seen), jnp.asarray([1.0, 4.0, 0.3, 2.0])
+    middle, noise = one.K[:, None, :2, 2], np.random.default_rng(0).normal(0, 3, one.points.shape)
+    K = one.K.at[:, :2, :2].multiply(scale[:, None, None])
+    one = replace(one, points=(one.points - middle) * scale[:, None, None] + middle + noise, K=K)
+    points = triangulate(one)[0]
+    cost = lambda points: np.square(reprojection_errors(one, points)).sum(axis=0)[KNOWN]
+    moves = 0.004 * np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)  # metres
+    least = np.min([cost(points + move) for move in moves], axis=0)
+    assert (cost(points) < least).all()
+
+
 def test_one_view_has_no_points_in_space():
     _, seen = scene(views=1)
     points, counts, _ = robust(seen)
