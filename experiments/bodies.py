@@ -149,21 +149,25 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     )
 
 
-def write_smplx(path: Path, body: BodyModel) -> None:
-    """A body with SMPL-X's joints as an SMPL-X model file: its shape directions, no expressions, no correctives if it has none.
+def write_smplx(
+    path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray
+) -> dict[str, np.ndarray]:
+    """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its arrays.
 
-    Raises: ValueError if it has other joints, or more shape directions than the format holds.
+    directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no expressions. more: arrays
+    beside these. Raises: ValueError if it has other joints, or more shape directions than the format holds.
     """
     count, n = body.shape_directions.shape[-1], len(body.template)
     if body.joint_names != JOINT_NAMES:
         raise ValueError(f"body '{body.name}' has other joints than SMPL-X")
-    if count > SHAPE_COLUMNS:
-        raise ValueError(f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}")
-    directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
-    directions[..., :count] = body.shape_directions
+    if directions is None:
+        if count > SHAPE_COLUMNS:
+            raise ValueError(f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}")
+        directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
+        directions[..., :count] = body.shape_directions
     correctives = np.zeros((n, 3, POSE_FEATURES), np.float32) if body.pose_directions is None else body.pose_directions
     parents = np.asarray(body.parents, np.int64) % 2**32  # the root's as the format has it
-    arrays = {
+    stored = {
         "v_template": body.template,
         "f": np.asarray(body.faces, np.uint32),
         "shapedirs": directions,
@@ -172,5 +176,8 @@ def write_smplx(path: Path, body: BodyModel) -> None:
         "weights": body.skinning_weights,
         "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.uint32),
     }
+    arrays = {key: np.asarray(x) for key, x in (stored | more).items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
     # no array is called allow_pickle, the stub's only other keyword
-    np.savez_compressed(path, **{key: np.asarray(x) for key, x in arrays.items()})  # ty: ignore[invalid-argument-type]
+    np.savez_compressed(path, **arrays)  # ty: ignore[invalid-argument-type]
+    return arrays

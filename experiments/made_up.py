@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from experiments.bodies import write_smplx
 from experiments.harness import Run, entry
 from humangs_jax.body.library import load_body
 from humangs_jax.body.resolution import decimate
@@ -48,28 +49,13 @@ def directions_of(people: Sequence[Any], body: Any) -> np.ndarray:
 def write_body(path: Path, people: Sequence[Any], body: Any, hand_poses: np.ndarray) -> dict[str, np.ndarray]:
     """The package's body as an SMPL-X model file, and its arrays. hand_poses: (people, 2, 45) that 12 components reach."""
     rng = np.random.default_rng(7)
-    n, joints = len(body.template), len(body.parents)
     means = 0.2 * rng.normal(size=(2, 45))
     components = rng.normal(size=(2, 45, 45))
     for i, hands in enumerate(hand_poses):
         components[:, i] = hands - means  # person i's hands are component i
-    parents = np.asarray(body.parents, np.int64)
-    arrays = {
-        "v_template": np.asarray(body.template),
-        "f": np.asarray(body.faces, np.uint32),
-        "shapedirs": directions_of(people, body),
-        "posedirs": np.zeros((n, 3, 9 * (joints - 1)), np.float32),
-        "J_regressor": np.asarray(body.joint_regressor),
-        "weights": np.asarray(body.skinning_weights),
-        "kintree_table": np.stack([np.where(parents < 0, 2**32 - 1, parents), np.arange(joints)]),
-        "hands_meanl": means[0],
-        "hands_meanr": means[1],
-        "hands_componentsl": components[0],
-        "hands_componentsr": components[1],
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **arrays)  # ty: ignore[invalid-argument-type]
-    return arrays
+    more = {f"hands_mean{side}": means[i] for i, side in enumerate("lr")}
+    more |= {f"hands_components{side}": components[i] for i, side in enumerate("lr")}
+    return write_smplx(path, body, directions_of(people, body), **more)
 
 
 def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list[Any], Any, Any]:

@@ -13,43 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import changes
-from experiments.changes import (
-    VIEWS,
-    Change,
-    at_the_pelvis,
-    betas,
-    cameras,
-    far,
-    focal,
-    grown,
-    masks,
-    moved_by,
-    noise,
-    outcome,
-    person_of,
-    photographed,
-    photos,
-    poses,
-    random_turns,
-    spoilt,
-    tall,
-    turned,
-    turned_by,
-    without_weights,
-    zoom,
-)
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY, markdown_table, write_json
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.reconstruct import fit_buffers
 from humangs_jax.body.library import load_body
 from humangs_jax.core.progress import bar
-from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.losses.loss_networks import NO_NETWORKS
-from humangs_jax.network import presets
-from humangs_jax.network.humangs import apply_humangs, init_humangs
+from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.subject import seeds_of
 from humangs_jax.training.config import LossConfig, TrainConfig
@@ -65,8 +38,8 @@ class Case:
     photographed anew, by the changed cameras. network: (variables, configuration) -> others.
     """
 
-    photos: Change = lambda capture: capture
-    held_out: Change = lambda capture: capture
+    photos: changes.Change = lambda capture: capture
+    held_out: changes.Change = lambda capture: capture
     photographed: bool = False
     network: Callable[[Any, Any], tuple[Any, Any]] = lambda variables, config: (variables, config)
 
@@ -97,50 +70,50 @@ def nan_in(variables: Any) -> Any:
 NOISE = np.random.default_rng(0)
 CASES: dict[str, Case] = {
     "as it is": Case(),
-    "4 stops over": Case(photos(lambda x: 16 * x)),
-    "4 stops under": Case(photos(lambda x: x / 16)),
-    "black": Case(photos(np.zeros_like)),
-    "white": Case(photos(np.ones_like)),
-    "noise": Case(photos(lambda x: NOISE.random(x.shape).astype(np.float32))),
-    "focal length x 2": Case(cameras(focal(2.0))),
-    "focal length / 2": Case(cameras(focal(0.5))),
-    "focal length x 10": Case(cameras(focal(10.0))),
-    "focal length / 10": Case(cameras(focal(0.1))),
-    "cameras inside the body": Case(at_the_pelvis),
-    "cameras at 100 m": Case(far(100.0), photographed=True),
-    "cameras look away": Case(cameras(matrix=turned)),
-    "person of 1 pixel": Case(zoom(1 / 150)),
-    "person of a twentieth of the frame": Case(zoom(0.06)),
-    "person cut at the frame": Case(zoom(3.0)),
-    "4 m tall": Case(tall(2.3), held_out=tall(2.3)),
-    "0.4 m tall": Case(tall(0.23), held_out=tall(0.23)),
-    "poses past joint limits": Case(poses(lambda x: 3 * x)),
-    "every joint at random": Case(poses(random_turns)),
-    "masks empty": Case(masks(np.zeros_like)),
-    "masks full": Case(masks(np.ones_like)),
-    "masks inverted": Case(masks(lambda x: 1 - x)),
+    "4 stops over": Case(changes.photos(lambda x: 16 * x)),
+    "4 stops under": Case(changes.photos(lambda x: x / 16)),
+    "black": Case(changes.photos(np.zeros_like)),
+    "white": Case(changes.photos(np.ones_like)),
+    "noise": Case(changes.photos(lambda x: NOISE.random(x.shape).astype(np.float32))),
+    "focal length x 2": Case(changes.cameras(changes.focal(2.0))),
+    "focal length / 2": Case(changes.cameras(changes.focal(0.5))),
+    "focal length x 10": Case(changes.cameras(changes.focal(10.0))),
+    "focal length / 10": Case(changes.cameras(changes.focal(0.1))),
+    "cameras inside the body": Case(changes.at_the_pelvis),
+    "cameras at 100 m": Case(changes.far(100.0), photographed=True),
+    "cameras look away": Case(changes.cameras(matrix=changes.turned)),
+    "person of 1 pixel": Case(changes.zoom(1 / 150)),
+    "person of a twentieth of the frame": Case(changes.zoom(0.06)),
+    "person cut at the frame": Case(changes.zoom(3.0)),
+    "4 m tall": Case(changes.tall(2.3), held_out=changes.tall(2.3)),
+    "0.4 m tall": Case(changes.tall(0.23), held_out=changes.tall(0.23)),
+    "poses past joint limits": Case(changes.poses(lambda x: 3 * x)),
+    "every joint at random": Case(changes.poses(changes.random_turns)),
+    "masks empty": Case(changes.masks(np.zeros_like)),
+    "masks full": Case(changes.masks(np.ones_like)),
+    "masks inverted": Case(changes.masks(lambda x: 1 - x)),
     "no masks": Case(lambda capture: dataclasses.replace(capture, masks=None)),
     "1 view": Case(lambda capture: capture.select([0])),
-    "32 views": Case(lambda capture: capture.select(list(range(VIEWS)) * 8)),
-    "one view four times": Case(lambda capture: capture.select([0] * VIEWS)),
-    "skinning weights of 0": Case(without_weights),
-    "betas 0": Case(betas(0.0)),
-    "betas 100": Case(betas(100.0)),
-    "NaN in images": Case(spoilt("images")),
-    "NaN in masks": Case(spoilt("masks")),
-    "NaN in betas": Case(spoilt("betas")),
-    "NaN in K": Case(spoilt("cameras.K")),
-    "NaN in cam_from_world": Case(spoilt("cameras.cam_from_world")),
-    "NaN in rotations": Case(spoilt("poses.rotations")),
-    "NaN in translation": Case(spoilt("poses.translation")),
-    "NaN in the template of the body": Case(spoilt("body.template")),
-    "NaN in the shape directions": Case(spoilt("body.shape_directions")),
-    "NaN in the joint regressor": Case(spoilt("body.joint_regressor")),
-    "NaN in the skinning weights": Case(spoilt("body.skinning_weights")),
-    "infinity in betas": Case(spoilt("betas", np.inf)),
+    "32 views": Case(lambda capture: capture.select(list(range(changes.VIEWS)) * 8)),
+    "one view four times": Case(lambda capture: capture.select([0] * changes.VIEWS)),
+    "skinning weights of 0": Case(changes.without_weights),
+    "betas 0": Case(changes.betas(0.0)),
+    "betas 100": Case(changes.betas(100.0)),
+    "NaN in images": Case(changes.spoilt("images")),
+    "NaN in masks": Case(changes.spoilt("masks")),
+    "NaN in betas": Case(changes.spoilt("betas")),
+    "NaN in K": Case(changes.spoilt("cameras.K")),
+    "NaN in cam_from_world": Case(changes.spoilt("cameras.cam_from_world")),
+    "NaN in rotations": Case(changes.spoilt("poses.rotations")),
+    "NaN in translation": Case(changes.spoilt("poses.translation")),
+    "NaN in the template of the body": Case(changes.spoilt("body.template")),
+    "NaN in the shape directions": Case(changes.spoilt("body.shape_directions")),
+    "NaN in the joint regressor": Case(changes.spoilt("body.joint_regressor")),
+    "NaN in the skinning weights": Case(changes.spoilt("body.skinning_weights")),
+    "infinity in betas": Case(changes.spoilt("betas", np.inf)),
     "NaN in the weights": Case(network=weights(nan_in)),
-    "NaN in a pose to be drawn": Case(held_out=spoilt("poses.rotations")),
-    "NaN in a camera that draws": Case(held_out=spoilt("cameras.K")),
+    "NaN in a pose to be drawn": Case(held_out=changes.spoilt("poses.rotations")),
+    "NaN in a camera that draws": Case(held_out=changes.spoilt("cameras.K")),
     "weights in bfloat16": Case(network=weights(in_type("bfloat16"))),
     "weights in float16": Case(network=weights(in_type("float16"))),
     "float16 compute": Case(network=computed("float16")),
@@ -163,9 +136,9 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
     (subject,), network = changes.subjects(1), load_weights()
 
     def measure(case):
-        capture = case.photos(subject.inputs(VIEWS))
-        capture = photographed(subject.seed, capture) if case.photographed else capture
-        return outcome(case.network(*network), capture, case.held_out(subject.held_out))
+        capture = case.photos(subject.inputs(changes.VIEWS))
+        capture = changes.photographed(subject.seed, capture) if case.photographed else capture
+        return changes.outcome(case.network(*network), capture, case.held_out(subject.held_out))
 
     chosen = [name for name in CASES if not cases or any(word in name for word in cases)]
     numbers = run.rows({name: functools.partial(measure, CASES[name]) for name in chosen})
@@ -189,30 +162,44 @@ BOUND = 1.0
 """Decibels of PSNR."""
 RENDERED = "distance of the cameras"
 """The quantity with new photos from the cameras as they are changed."""
-LIMITS: dict[str, tuple[str, float | None, dict[float, Change]]] = {
-    "photos": ("", 4, {n: lambda c, n=n: c.select(list(range(0, VIEWS, VIEWS // n))) for n in (1, 2)}),
+LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
+    "photos": ("", 4, {n: lambda c, n=n: c.select(list(range(0, changes.VIEWS, changes.VIEWS // n))) for n in (1, 2)}),
     "noise": (
         "standard deviation",
         0,
-        {x: photos(lambda image, x=x: image + x * noise(4, image.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
+        {
+            x: changes.photos(lambda image, x=x: image + x * changes.noise(4, image.shape))
+            for x in (0.05, 0.1, 0.2, 0.4)
+        },
     ),
-    "distance of the cameras": ("m", None, {x: far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)}),
-    "height of the person": ("pixels of 256", None, {x: person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
-    "masks too large or small": ("pixels of 256", 0, {x: grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
-    "focal length": ("%", 0, {x: cameras(focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
-    "cameras turned": ("degrees", 0, {x: turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
+    "distance of the cameras": (
+        "m",
+        None,
+        {x: changes.far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)},
+    ),
+    "height of the person": (
+        "pixels of 256",
+        None,
+        {x: changes.person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)},
+    ),
+    "masks too large or small": ("pixels of 256", 0, {x: changes.grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
+    "focal length": ("%", 0, {x: changes.cameras(changes.focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
+    "cameras turned": ("degrees", 0, {x: changes.turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
     "joints turned": (
         "degrees",
         0,
-        {x: poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
+        {
+            x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * changes.noise(5, r.shape))
+            for x in (1, 2, 4, 8, 16)
+        },
     ),
-    "body moved": ("cm", 0, {x: moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
+    "body moved": ("cm", 0, {x: changes.moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
     "shape coefficients": (
         "standard deviations",
         0,
         {
             x: lambda c, x=x: dataclasses.replace(
-                c, betas=np.asarray(c.betas) + np.float32(x * noise(6, c.betas.shape))
+                c, betas=np.asarray(c.betas) + np.float32(x * changes.noise(6, c.betas.shape))
             )
             for x in (0.25, 0.5, 1, 2)
         },
@@ -236,9 +223,9 @@ def limits(run: Run, people: int = 2) -> None:
     def score(name, change):
         scores = []
         for subject in chosen:
-            capture = change(subject.inputs(VIEWS))
-            capture = photographed(subject.seed, capture) if name == RENDERED else capture
-            scores.append(outcome(network, capture, subject.held_out)["psnr"])
+            capture = change(subject.inputs(changes.VIEWS))
+            capture = changes.photographed(subject.seed, capture) if name == RENDERED else capture
+            scores.append(changes.outcome(network, capture, subject.held_out)["psnr"])
         return float(np.mean(scores))
 
     tried = {(name, value): change for name, (_, _, each) in LIMITS.items() for value, change in each.items()}
@@ -288,39 +275,26 @@ TARGETS = 2
 
 
 @entry
-def stability(
-    run: Run,
-    networks: tuple[Literal["shipped", "published"], ...] = ("shipped", "published"),
-    types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"),
-    seeds: int = 3,
-    published_size: int = 128,
-) -> None:
+def stability(run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"), seeds: int = 3) -> None:
     """Error of every stage, from photos to images and back to gradients, by number type, against float64 from the same numbers.
 
-    "shipped": the shipped weights on people of the validation seeds. "published": the published architecture with random weights,
-    drawn anew for every seed, on the demo person. An error is a relative L2 norm, the largest over the arrays of a stage and over
-    the seeds: of what the stage gives, of the gradients that it sends back, and of those of its parameters. float16 runs forward
-    only. tf32: float32 with products as the device's matrix units compute them; left out where the device has none.
+    The shipped weights on people of the validation seeds. An error is a relative L2 norm, the largest over the arrays of a stage
+    and over the people: of what the stage gives, of the gradients that it sends back, and of those of its parameters. float16
+    runs forward only. tf32: float32 with products as the device's matrix units compute them; left out where it has none.
 
-    Tables: stability_shipped, stability_published
+    Tables: stability_shipped
 
     Options:
     types: number types to compare
-    seeds: people, or draws of the weights
-    published_size: side of the published network's photos, pixels
+    seeds: people
     """
-    for network in networks:
-        make = {"shipped": shipped_case, "published": published_case}[network]
-        cases = with_room([make(seed, published_size) for seed in range(seeds)])
-        worst = _worst(cases, [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
-        measured = list(next(iter(worst.values())))
-        columns = [(name, column) for name in measured for column in COLUMNS if name != "float16" or column == "values"]
-        show = lambda stage, name, column: (
-            f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
-        )
-        rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
-        header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
-        run.show(markdown_table(header, rows), {"seeds": seeds} | worst, f"{run.table}_{network}")
+    cases = with_room([shipped_case(seed) for seed in range(seeds)])
+    worst = _worst(cases, [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
+    columns = [(n, c) for n in next(iter(worst.values())) for c in COLUMNS if n != "float16" or c == "values"]
+    show = lambda stage, name, column: f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+    rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
+    header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
+    run.show(markdown_table(header, rows), {"seeds": seeds} | worst, "stability_shipped")
 
 
 def _worst(cases, types):
@@ -357,20 +331,13 @@ def relative_error(value, truth):
     return float(difference / norm) if norm else float(difference)
 
 
-def shipped_case(seed, _):
+def shipped_case(seed):
     """Variables, configuration, body and example of a person of the validation seeds."""
     body, (variables, config) = load_body(), load_weights()
-    person = make_evaluation_subject(seeds_of("validation", seed, 1)[0], body, [VIEWS], 256, HeldOut(TARGETS, 0, 0))
-    return variables, config, body, person.inputs(VIEWS), person.held_out
-
-
-def published_case(seed, size):
-    """The same for the published architecture with random weights, on the demo person."""
-    body, capture = load_body(), load_capture("demo_capture")
-    config = presets.published().with_conventions(image_size=size, body_vertices=4000)
-    config = config.with_runtime(dtype="float32", tokens="foreground")
-    variables = init_humangs(jax.random.key(seed), config)
-    return variables, config, body, capture, load_capture("demo_capture/held_out").select(range(TARGETS))
+    person = make_evaluation_subject(
+        seeds_of("validation", seed, 1)[0], body, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0)
+    )
+    return variables, config, body, person.inputs(changes.VIEWS), person.held_out
 
 
 def observe(case, name):

@@ -26,7 +26,7 @@ CASES = {
     "splatting_finite_differences": "--size 32",
     "splatting": "--sizes 64 --repeats 1",
     "splatting_tradeoff": "--size 64 --repeats 1 --image FOLDER/a.png --only preset scale",
-    "stability": "--networks shipped --types float32 --seeds 1",
+    "stability": "--types float32 --seeds 1",
     "training_cost": "--preset tiny --chips 1 --sizes 32 --variants kept",
     "training_extremes": "--steps 6 --only",
     "training_steps": "--repeats 1 --only",
