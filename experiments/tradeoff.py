@@ -21,7 +21,6 @@ import numpy as np
 
 from experiments import tradeoff_report
 from experiments.harness import Run, entry
-from experiments.reconstruction import random_variables
 from experiments.results import write_json
 from experiments.subjects import (
     TASKS,
@@ -45,7 +44,6 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.io.images import resized
-from humangs_jax.network.presets import published
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.subject import GENERATOR_VERSION, seeds_of
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
@@ -93,7 +91,6 @@ def tradeoff(
         if described(each) != rows.get(each.name, {}).get("what"):
             rows[each.name] = {"what": described(each), "people": []}
     missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
-    missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
     if missing:
         bench = Bench(subjects, people, iterations)
         # all of one person, then the next: times are of the first
@@ -167,9 +164,6 @@ class Bench:
 
     def measure(self, point, i: int, row: dict[str, Any]) -> None:
         """Adds a person's scores to a point's row; with the first, also times, memory and bytes."""
-        if point.start == "published network":
-            row |= self.published(point)
-            return
         avatar = self.made(point, i)
         scores = self.scores(point, avatar, self.person(i))
         if i == 0 and point.start == "vertex-color baseline":
@@ -302,15 +296,3 @@ class Bench:
         ]
         make, frame = (np.median(pairs, axis=0) for pairs in (makes, frames))
         return {"reconstruct": float(make[0] / make[1]), "refine_share": 0.0, "frame": float(frame[0] / frame[1])}
-
-    def published(self, point) -> dict[str, Any]:
-        """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
-        config = published().with_conventions(image_size=256)
-        variables, photos = random_variables(config), self.person(0).inputs(4)
-        make = lambda: reconstruct_with(point.settings, variables, config, photos)
-        make()
-        pairs = [(timed(make)[1], self.default_make_ms()) for _ in range(2)]
-        own, default = np.median(pairs, axis=0)
-        with peak_memory() as peak:
-            avatar = make()
-        return {"reconstruct": float(own / default), "memory_mb": peak[0], "gaussians": len(avatar.gaussians.means)}

@@ -12,13 +12,13 @@ from humangs_jax.network.runtime import Runtime
 
 SIZE = 512
 """Side of the frames that points are compared at."""
-STARTS = ("network", "random colors", "vertex-color baseline", "published network")
+STARTS = ("network", "random colors", "vertex-color baseline")
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
     """A way to make an avatar and draw it. size: side of the frames, pixels. start: of `STARTS`: the last ones are to compare
-    with; of the published network, whose weights are not ours to ship, only time and memory are measured.
+    with.
     """
 
     name: str
@@ -64,9 +64,6 @@ def points() -> list[Point]:
     found += [point("100 steps at 512", "refinement", refine_steps=100, refine_size=512)]
     found += [refined(*limits) for limits in ITERATIONS]
     found += [combined(**fields) for fields in COMBINED]
-    found += [
-        point(f"published, {t} tokens", "published", start="published network", tokens=t) for t in ("foreground", "all")
-    ]
     return found
 
 
