@@ -105,7 +105,7 @@ def evaluation_views(
 
 
 def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) -> str:
-    """Scores by number of photos and task, whether more photos help, the best and the worst people.
+    """Scores by number of photos and task, whether more photos help.
 
     by_views: scores by number of photos and seed. chosen: the number of photos of what is said of single people.
     """
@@ -113,20 +113,11 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
     tasks = [task for task in TASKS if task in mean[chosen]]
     keys = [key for key in COLUMNS if mean[chosen][tasks[0]].get(key) is not None]
     rows = [[TASKS[task], n, *cells(mean[n][task], keys)] for task in tasks for n in mean]
-    best, worst = extremes(by_views[chosen])
-    header, ends = ["", "seed"], []
-    for task in tasks:
-        header += [f"{TASKS[task]}: PSNR", "foreground PSNR", "vertex-color baseline"]
-    for name, seeds in (("best", best), ("worst", worst)):
-        for place, seed in enumerate(seeds, 1):
-            numbers = [cells(by_views[chosen][seed][task], ("psnr", "psnr_fg", "baseline_psnr")) for task in tasks]
-            ends.append([f"{name} {place}", seed, *itertools.chain(*numbers)])
     return "\n\n".join(
         (
             about,
             markdown_table(["task", "photos", *(COLUMNS[key][0] for key in keys)], rows),
             " ".join(verdict(by_views, chosen, task) for task in tasks),
-            markdown_table(header, ends),
         )
     )
 
