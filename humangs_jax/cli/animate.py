@@ -8,7 +8,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import VIDEOS
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.cli.options import Place, Preset, UsageError, chosen_settings
+from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
@@ -43,6 +43,7 @@ class Animate:
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
     motion: Annotated[Path | None, arg(help=f"{MOTIONS.listed()}. Default: the shipped walk.")] = None
+    part: OmitArgPrefixes[PartOfMotion] = WHOLE
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
@@ -66,14 +67,13 @@ class Animate:
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.frames import excerpt, images, motion_views
             from humangs_jax.avatar.video import check_video, write_video
-            from humangs_jax.data.motion import load_motion
             from humangs_jax.io.reading import reading
 
             check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
-            motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
+            motion = self.part.load(self.motion, avatar.rest_joints)
             with reading(self.motion or "the motion", "motion"):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
@@ -82,9 +82,7 @@ class Animate:
         with stage("drawing"):
             written = write_video(self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps)
         wrote(self.out, f"{written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
-        suggest(
-            "humangs export", self.avatar, "--html avatar.html", *(("--motion", self.motion) if self.motion else ())
-        )
+        suggest("humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,6 +189,7 @@ class View:
     """File written by `humangs reconstruct`. With --live: of `humangs refine --live`, or the folder of a training run."""
     motion: Path | None = None
     """The motion it plays. Default: the shipped walk."""
+    part: OmitArgPrefixes[PartOfMotion] = WHOLE
     port: Annotated[int, Range(0, 65535)] = 0
     """Port on 127.0.0.1; 0 for any free one."""
     browser: bool = True
@@ -203,13 +202,10 @@ class View:
     def run(self) -> None:
         if self.capture is not None and not self.live:
             raise UsageError("--capture: only with --live")
-        with stage("starting"):
-            from humangs_jax.data.motion import load_motion
-
         if self.live:
             from humangs_jax.viewer.live import follow
 
-            motion = None if self.motion is None else load_motion(self.motion)
+            motion = None if self.motion is None else self.part.load(self.motion)
             follow(self.avatar, self.capture, motion, self.port, self.browser)
             return
         with stage("making the page"):
@@ -217,7 +213,7 @@ class View:
             from humangs_jax.viewer.page import page_html, serve
 
             avatar = Avatar.load(self.avatar)
-            motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
+            motion = None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
             name = None if self.motion is None else self.motion.stem
             text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)

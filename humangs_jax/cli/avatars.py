@@ -5,11 +5,13 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
 from humangs_jax.cli.options import (
     AVATAR,
+    WHOLE,
+    PartOfMotion,
     Place,
     Preset,
     Side,
@@ -327,6 +329,7 @@ class Export:
     """The body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
     motion: Path | None = None
     """The motion that the viewer plays (default: the shipped walk) or that poses --out (default: T-pose). docs: motions."""
+    part: OmitArgPrefixes[PartOfMotion] = WHOLE
     frame: int | None = None
     """Which frame of the motion, from 0. Default: the first."""
     frames: str | None = None
@@ -343,10 +346,9 @@ class Export:
         self._check(out)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
-            from humangs_jax.data.motion import load_motion
 
             avatar = Avatar.load(self.avatar)
-            motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
+            motion = None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
         if self.html is not None:
             with stage("making the page"):
                 from humangs_jax.viewer.page import write_page
@@ -356,7 +358,7 @@ class Export:
             wrote(self.html, f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
             self._write(out, avatar, motion)
-        played = () if self.motion is None else ("--motion", self.motion)
+        played = self.part.options(self.motion)
         if self.html is None:
             suggest("humangs export", self.avatar, "--html avatar.html", *played)
         else:

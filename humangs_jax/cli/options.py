@@ -24,6 +24,8 @@ from humangs_jax.core.registry import alternatives
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
+    from humangs_jax.core.array_types import Array
+    from humangs_jax.data.motion import Motion
 
 LARGEST_IMAGE = 8192
 """Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn."""
@@ -42,6 +44,36 @@ class UsageError(ValueError):
 def option_of(argument: str) -> str:
     """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are written to --out."""
     return "--out" if argument == "path" else f"--{argument.replace('_', '-')}"
+
+
+@dataclasses.dataclass(frozen=True)
+class PartOfMotion:
+    """What of the file of --motion is played."""
+
+    motion_fps: Annotated[float | None, Range(0.01, 1000.0)] = None
+    """Frames per second of the motion, where its file says none. Default: those of the file."""
+    person: int | None = None
+    """Number of the person, in a motion of several people."""
+    clip: str | None = None
+    """Name or number of the animation, in a .glb of several. Default: the first."""
+
+    def options(self, path: Path | None) -> tuple[str | Path, ...]:
+        """What another command says to play the same; of a file, or nothing."""
+        said = [
+            part for name, value in vars(self).items() if value is not None for part in (option_of(name), str(value))
+        ]
+        return () if path is None else ("--motion", path, *said)
+
+    def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
+        """The motion of a file; None: the shipped walk. Raises: MotionError."""
+        from humangs_jax.data.motion import load_motion
+
+        if path is None and (said := [name for name, value in vars(self).items() if value is not None]):
+            raise UsageError(f"{option_of(said[0])}: expected --motion with it")
+        return load_motion(path, fps=self.motion_fps, person=self.person, clip=self.clip, rest_joints=rest_joints)
+
+
+WHOLE = PartOfMotion()
 
 
 @dataclasses.dataclass(frozen=True)

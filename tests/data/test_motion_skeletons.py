@@ -193,20 +193,89 @@ def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
     assert np.ptp(ours[:, 0, 1]) > 0.3  # they were squats
 
 
-def test_names_of_other_schemes(tmp_path):
-    """A prefix that all joints share, sides behind the name, and SMPL's own, whose foot is the toe and whose shoulder the arm."""
-    rest, poses = person(), dance(3, names=CMU)
-    unreal = {"shoulder": "upperarm", "elbow": "lowerarm", "wrist": "hand", "collar": "clavicle"}
-    unreal |= {"hip": "thigh", "knee": "calf", "ankle": "foot", "foot": "ball"}
-    schemes = [
-        {ours: f"Model_{theirs}" for ours, theirs in CMU.items()},
-        {ours: ours for ours in CMU},
-        {ours: ours.replace("left_", "L_").replace("right_", "R_") for ours in CMU},
-        {o: f"{unreal[o.split('_')[1]]}_{o[0]}" if "_" in o else {"neck": "neck_01"}.get(o, o) for o in CMU},
-    ]
-    for names in schemes:
-        rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, names), rest_joints=rest)
-        np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+def renamed(limbs, form="{side}{limb}", **middle):
+    """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as given."""
+    parts = dict(
+        zip(("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"), limbs.split(), strict=True)
+    )
+    names = {
+        "pelvis": "Hips",
+        "spine1": "Spine",
+        "spine2": "Chest",
+        "spine3": "UpperChest",
+        "neck": "Neck",
+        "head": "Head",
+    } | middle
+    sided = lambda ours: form.format(
+        side=ours.split("_")[0].title(), s=ours[0], S=ours[0].upper(), limb=parts[ours.split("_")[1]]
+    )
+    return {ours: sided(ours) if "_" in ours else names[ours] for ours in CMU}
+
+
+NAMED = {
+    "a common beginning": {ours: f"Model_{theirs}" for ours, theirs in CMU.items()},
+    "a common end": {ours: f"{theirs}_JNT" for ours, theirs in CMU.items()},
+    "SMPL": {ours: ours for ours in CMU},
+    "SMPL, L_": {ours: ours.replace("left_", "L_").replace("right_", "R_") for ours in CMU},
+    "Unreal": renamed(
+        "clavicle upperarm lowerarm hand thigh calf foot ball", "{limb}_{s}", pelvis="pelvis", neck="neck_01"
+    ),
+    "Unity": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes"),
+    "VRM": renamed(
+        "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase", "J_Bip_{S}_{limb}", pelvis="J_Bip_C_Hips"
+    ),
+    "Bandai-Namco": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes", "{limb}_{S}"),
+    "Xsens": renamed(
+        "Shoulder UpperArm ForeArm Hand UpperLeg LowerLeg Foot Toe",
+        pelvis="Pelvis",
+        spine1="L5",
+        spine2="L3",
+        spine3="T8",
+    ),
+    "SOMA": renamed("Shoulder Arm ForeArm Hand Leg Shin Foot ToeBase", neck="Neck1"),
+    "Rocketbox": renamed(
+        "Clavicle UpperArm Forearm Hand Thigh Calf Foot Toe0", "Bip01 {S} {limb}", pelvis="Bip01 Pelvis"
+    ),
+    "Rigify": renamed(
+        *("shoulder upper_arm forearm hand thigh shin foot toe", "DEF-{limb}.{S}"),
+        **{"pelvis": "DEF-spine", "neck": "DEF-spine.004", "head": "DEF-spine.006"}
+        | {f"spine{i}": f"DEF-spine.00{i}" for i in (1, 2, 3)},
+    ),
+    "JNT": renamed(
+        "clav uparm loarm hand upleg loleg foot ball", "{s}_{limb}_JNT", pelvis="c_root_JNT", neck="neck_JNT"
+    ),
+    "Daz": renamed(
+        "Collar ShldrBend ForearmBend Hand ThighBend Shin Foot Toe", "{s}{limb}", pelvis="hip", neck="neckLower"
+    ),
+    "Advanced Skeleton": renamed(
+        "Scapula Shoulder Elbow Wrist Hip Knee Ankle Toes", "{limb}_{S}", pelvis="Root_M", head="Head_M"
+    ),
+    "behind": renamed("Shoulder Arm ForeArm Hand UpLeg Leg Foot ToeBase", "{limb}Left", pelvis="Hips")
+    | {ours: f"{theirs}.R" for ours, theirs in CMU.items() if ours.startswith("right")},
+    "numbers": {ours: f"Joint_{i:02d}" for i, ours in enumerate(CMU)},
+    "numbers backwards": {ours: f"bone{40 - i}" for i, ours in enumerate(CMU)},
+    "unknown words": {ours: f"part {i * 7919 % 1000}" for i, ours in enumerate(CMU)},
+}
+NAMED["behind"] |= {
+    ours: name.replace("Right", "") for ours, name in NAMED["behind"].items() if ours.startswith("right")
+}
+
+
+@pytest.mark.parametrize("scheme", NAMED)
+def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
+    rest, poses = person(), dance(3, names=CMU, scale=0.2)
+    rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, NAMED[scheme]), rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
+def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
+    """Where bones lie along one axis in the rest pose nothing tells where it points: as in T-pose on average."""
+    rest, short = person(), {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")}
+    poses = without_twist(rest, dance(names=short, scale=0.2))
+    ankles = [INDEX[f"{side}_ankle"] for side in ("left", "right")]
+    poses[:, ankles] = 0
+    rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, short, frames_along_bones(rest)), rest_joints=rest)
+    np.testing.assert_allclose(rotations[:, ankles], 0, atol=1e-4)
 
 
 @pytest.mark.parametrize("gap", [" ", "   ", "\t", " \t "])
@@ -242,7 +311,7 @@ BAD = {
     "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
     "open": ("HIERARCHY ROOT Hips { OFFSET 0 0 0 ", "a brace of the joints is open"),
     "no motion": (HEAD, "expected MOTION, Frames: and Frame Time:"),
-    "strange": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n", "expected the names of CMU, Mixamo or LaFAN"),
+    "strange": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n", "expected the names of CMU, Mixamo, Unity"),
     "few": (HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n", "expected 2 frames of 3 numbers, got 3 numbers"),
     "nan": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n", "expected finite numbers, got nan"),
     "letters": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 x 0\n", "frames: expected numbers"),
@@ -282,7 +351,9 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
 # GLB --------------------------------------------------------------------------------------------------------------------
 
 
-def write_glb(path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR"):
+def write_glb(
+    path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR", more=(), titles=()
+):
     """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
     place = {name: i for i, name in enumerate(joints)}
@@ -309,15 +380,20 @@ def write_glb(path, rest, poses, moves, names, bind=None, fps=24.0, above=None, 
         matrix = np.eye(4)
         matrix[:3, 3] = rest[j]
         inverse.append(np.linalg.inv(outer @ matrix).T.reshape(-1))
-        animate(place[name], "rotation", Rotation.from_rotvec(poses[:, j]).as_quat())
-    animate(0, "translation", moves)
     roots = [0]
     if above is not None:
         nodes.append(above | {"children": [0]})
         roots = [len(nodes) - 1]
     skin = {"joints": list(range(len(joints))), "inverseBindMatrices": writer.array("MAT4", np.stack(inverse))}
     document = {"scene": 0, "scenes": [{"nodes": roots}], "nodes": nodes, "skins": [skin]}
-    writer.write(path, document | {"animations": [{"channels": channels, "samplers": samplers}]})
+    animations = []
+    for i, each in enumerate((poses, *more)):
+        channels, samplers = [], []
+        for name in joints:
+            animate(place[name], "rotation", Rotation.from_rotvec(each[:, INDEX[name]]).as_quat())
+        animate(0, "translation", moves)
+        animations.append({"channels": channels, "samplers": samplers} | ({"name": titles[i]} if titles else {}))
+    writer.write(path, document | {"animations": animations})
 
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "CUBICSPLINE", "STEP"])
@@ -345,6 +421,18 @@ def test_a_glb_in_centimetres_below_a_turned_node(tmp_path):
     motion = load_motion(tmp_path / "a.glb", rest_joints=rest)
     np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
     np.testing.assert_allclose((motion.translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_a_clip_of_several_is_chosen_by_name_or_number(tmp_path, caplog):
+    rest, names = person(), ("Idle", "Run", "Walk")
+    clips = [dance(2, seed) for seed in range(3)]
+    write_glb(tmp_path / "a.vrma", rest, clips[0], np.zeros((2, 3)), MIXAMO, more=clips[1:], titles=names)
+    for chosen, poses in ((None, clips[0]), ("run", clips[1]), (2, clips[2])):
+        motion = load_motion(tmp_path / "a.vrma", rest_joints=rest, clip=chosen)
+        np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
+    assert caplog.text.count("3 animations (Idle, Run, Walk): the first is taken") == 1
+    with pytest.raises(MotionError, match=r"a\.vrma: clip Jump: expected one of Idle, Run, Walk"):
+        load_motion(tmp_path / "a.vrma", rest_joints=rest, clip="Jump")
 
 
 def test_glb_files_that_are_no_motion(tmp_path):

@@ -96,6 +96,29 @@ def skeletons():
     files["spaces, braces, lines of Windows"] = (
         files["spaces"].replace("\n\t", " \n").replace("\r", "").replace("\n", "\r\n")
     )
+    unity = {
+        "UpLeg": "UpperLeg",
+        "Leg": "LowerLeg",
+        "ForeArm": "LowerArm",
+        "Arm": "UpperArm",
+        "ToeBase": "Toes",
+        "Hips": "J_Hips",
+    }
+    for kind, names in {
+        "Unity": {ours: unity.get(theirs, theirs) for ours, theirs in CMU.items()}
+        | {
+            ours: theirs[: -len(w)] + unity[w]
+            for w in unity
+            for ours, theirs in CMU.items()
+            if theirs in ("Left" + w, "Right" + w)
+        },
+        "unknown": {ours: f"part {i}" for i, ours in enumerate(CMU)},
+        "Rigify": CMU | {"pelvis": "spine", "neck": "spine.004", "head": "spine.006"},
+        "no toes": {ours: theirs for ours, theirs in CMU.items() if not ours.endswith("_foot")},
+    }.items():
+        files[kind] = write_bvh(source, poses(names), names, moves=moves)
+    short = {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")}
+    files["no toes, no standing"] = write_bvh(source, poses(short), short, frames_along_bones(source), moves)
     files["odd names"] = (
         files["A-pose"].replace("JOINT Head", "JOINT constructor").replace("JOINT Neck", "JOINT __proto__")
     )

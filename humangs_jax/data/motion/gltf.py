@@ -1,4 +1,4 @@
-"""Skeleton animations in GLB files: the first animation, on the joints of its skin.
+"""Skeleton animations in GLB files: one of its animations, on the joints of its skin.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations. The rest pose is the one in which the skin was bound to the
 mesh (inverse bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated linearly.
@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import DEFAULT_FPS
+from humangs_jax.data.motion.motion import Reading
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
@@ -27,18 +28,19 @@ Tracks = dict[tuple[int, str], Track]
 """By node and path."""
 
 
-def read_animation(path: Path, options: object = None) -> Clip:
+def read_animation(path: Path, options: Reading | None = None) -> Clip:
     """The skeleton of a GLB file in motion. Raises: OSError; Refused and what damaged numbers raise."""
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")
     nodes, animations = content.get("nodes", []), content.get("animations", [])
     if not animations:
         raise Refused("a GLB file without an animation: expected a skeleton in motion")
+    animation, said = _chosen(animations, options.clip if options else None)
     parents = _parents(nodes)
     joints, binding = _joints(content, binary, nodes)
     order = _with_ancestors(joints, parents)
     check_limit("joints", len(order), "joints")
-    tracks = _tracks(content, binary, animations[0], set(order))
+    tracks = _tracks(content, binary, animation, set(order))
     times, fps = _times(tracks)
     check_unpacked(len(data), 3 * bytes_of_clip(len(times), len(order)))
     posed = _world(nodes, parents, order, tracks, times)
@@ -49,7 +51,26 @@ def read_animation(path: Path, options: object = None) -> Clip:
     turns = _rotations(matrices) @ np.swapaxes(_rotations(bind), -1, -2)
     names = tuple(str(nodes[joint].get("name", "")) for joint in joints)
     above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
-    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, up="y")
+    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said)
+
+
+SHOWN = 12
+"""Names of animations in a line."""
+
+
+def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
+    """The animation of a name or number, the first if none is asked for, and what is to be said. Raises: Refused."""
+    names = [str(each.get("name", i)) for i, each in enumerate(animations)]
+    listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+    if clip is None:
+        said = f"{len(names)} animations ({listed}): the first is taken; clip= takes another" if len(names) > 1 else ""
+        return animations[0], said
+    plain = [name.casefold() for name in names]
+    if clip.casefold() in plain:
+        return animations[plain.index(clip.casefold())], ""
+    if clip.isdecimal() and int(clip) < len(names):
+        return animations[int(clip)], ""
+    raise Refused(f"clip {clip}: expected one of {listed}")
 
 
 def _parents(nodes: Nodes) -> list[int]:

@@ -37,25 +37,69 @@ NO_PLACES = "the file has no positions ({}): people stay in place"
 
 # Names of joints --------------------------------------------------------------------------------------------------------
 
+_BONES = (("proximal",), ("intermediate",), ("distal",))
+
+
+def _finger(finger: str, i: int) -> tuple[str, ...]:
+    """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the thumb."""
+    number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
+    words = (finger, "little") if finger == "pinky" else (finger,)
+    plain = [
+        form for w in words for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
+    ]
+    bones = (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",)) if finger == "thumb" else _BONES
+    plain += [w + bone for w in words for bone in bones[i - 1]]
+    return (*plain, f"finger{number}{i - 1 or ''}")
+
+
 SIDED = {
-    "hip": ("upleg", "thigh", "hip"),
-    "knee": ("leg", "shin", "lowleg", "lowerleg", "calf", "knee"),
+    "hip": ("upleg", "upperleg", "thigh", "thighbend", "hip", "femur", "legupper", "leg"),
+    "knee": ("leg", "shin", "lowleg", "lowerleg", "calf", "knee", "shinbend", "tibia", "leglower"),
     "ankle": ("ankle", "foot"),
-    "foot": ("toebase", "toe", "toe0", "ball", "foot"),
-    "shoulder": ("arm", "uparm", "upperarm", "shldr", "shoulder"),
-    "collar": ("collar", "clavicle", "shoulder"),
-    "elbow": ("forearm", "lowarm", "lowerarm", "elbow"),
+    "foot": ("toebase", "toe", "toes", "toe0", "ball", "foot"),
+    "shoulder": ("arm", "uparm", "upperarm", "shldr", "shldrbend", "humerus", "armupper", "shoulder"),
+    "collar": ("collar", "clavicle", "scapula", "shoulder"),
+    "elbow": ("forearm", "lowarm", "lowerarm", "elbow", "forearmbend", "armlower"),
     "wrist": ("hand", "wrist"),
     "eye": ("eye",),
-    **{f"{finger}{i}": (f"hand{finger}{i}", f"{finger}{i}", f"{finger}0{i}") for finger in FINGERS for i in (1, 2, 3)},
+    **{f"{finger}{i}": _finger(finger, i) for finger in FINGERS for i in (1, 2, 3)},
 }
 """Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN,
-MotionBuilder, Biovision, Biped, SMPL, Unreal. A joint of the file is taken once, by the first that wants it: "shoulder" is the
-upper arm where there is no other and else the collar bone."""
+MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify, Daz, Advanced Skeleton. A joint
+of the file is taken once, by the first that wants it: "shoulder" is the upper arm where there is no other, else the collar."""
 MIDDLE = {
-    **{"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01")},
+    **{"pelvis": ("hips", "hip", "pelvis"), "neck": ("neck", "neck1", "neck01", "necklower")},
     **{"head": ("head",), "jaw": ("jaw",)},
 }
+NOISE = (
+    *(
+        "j",
+        "c",
+        "m",
+        "bip",
+        "bip01",
+        "bip001",
+        "bip1",
+        "biped",
+        "def",
+        "org",
+        "jnt",
+        "joint",
+        "bind",
+        "bone",
+        "skin",
+        "sk",
+        "ctrl",
+    ),
+    *("rig", "armature", "character", "valvebiped", "avatar"),
+)
+"""Words in names that say nothing of the joint."""
+ENDS = ("end", "nub", "top", "tip", "site")
+"""How names of the ends of bones end."""
+UNDER = (("hip", "knee"), ("knee", "ankle"), ("ankle", "foot"), ("shoulder", "elbow"), ("elbow", "wrist"))
+"""Which joints hang below which."""
+LIKE = 0.15
+"""Share by which the bones of two limbs may differ."""
 SIDES = ("left", "right")
 _CHAINS = (
     ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
@@ -76,7 +120,9 @@ TOPS = ("spine3", "neck", "left_shoulder")
 """Where the trunk ends: the first that the file has."""
 FEET = tuple(tuple(f"{side}_{name}" for side in SIDES) for name in ("ankle", "foot"))
 """Joints that may touch the floor, of both sides by kind."""
-EXPECTED_NAMES = "expected the names of CMU, Mixamo or LaFAN"
+EXPECTED_NAMES = (
+    "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of a person"
+)
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
@@ -239,7 +285,8 @@ def turned_upright(
 
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
-    names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE SIDES NEXT NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING
+    names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT NEEDED TOPS FEET EXPECTED_NAMES
+    FEW STANDING
     BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS
     ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}

@@ -21,7 +21,6 @@ as high above the floor as in the file, whatever the shares of thighs, shins and
 
 import dataclasses
 import functools
-import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 
@@ -31,18 +30,14 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.library import read_body
 from humangs_jax.body.model import JOINT_NAMES, PARENTS
 from humangs_jax.core.array_types import Float
+from humangs_jax.data.motion.matching import matched
 from humangs_jax.data.motion.rules import (
     BETTER_TILT,
     CLEARLY_UP,
-    EXPECTED_NAMES,
     FEET,
-    FEW,
     LARGEST_BEND,
-    MIDDLE,
-    NEEDED,
     NEXT,
     RATE_ROUNDING,
-    SIDED,
     SIDES,
     STANDING,
     TOPS,
@@ -102,10 +97,7 @@ def retargeted(
     """
     if joints.shape != (len(JOINT_NAMES), 3):
         raise Refused(f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has {len(joints)}")
-    source = _matched(clip)
-    if missing := [name for name in NEEDED if name not in source]:
-        found = ", ".join(clip.names[:12])
-        raise Refused(f"no joint for {', '.join(missing)}: {EXPECTED_NAMES}, got {found}")
+    source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
     standing, said = _stands(clip, source), ""
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
     if up == "auto":
@@ -138,51 +130,6 @@ def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[st
 
 
 _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
-
-
-# Names ------------------------------------------------------------------------------------------------------------------
-
-
-def _matched(clip: Clip) -> dict[str, int]:
-    """Index of the clip's joint for each joint of ours that it has."""
-    names = [re.sub(r"^.*[:|]", "", name) for name in clip.names]
-    names = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
-    prefix = _common_start(names) if len(names) >= FEW else 0
-    names = [re.sub(r"^mixamorig\d*", "", name[prefix:]) for name in names]
-    source: dict[str, int] = {}
-
-    def find(ours, theirs):
-        taken = set(source.values())
-        for name in theirs:
-            if name in names and (index := names.index(name)) not in taken:
-                source[ours] = index
-                return
-
-    for ours, theirs in MIDDLE.items():
-        find(ours, theirs)
-    for ours, theirs in SIDED.items():
-        for side in SIDES:
-            find(f"{side}_{ours}", [form for x in theirs for form in (side + x, side[0] + x, x + side[0])])
-    _match_spine(clip, source)
-    return source
-
-
-def _common_start(names: Sequence[str]) -> int:
-    """How many first letters are the same in all names."""
-    return next((i for i, letters in enumerate(zip(*names, strict=False)) if len(set(letters)) > 1), 0)
-
-
-def _match_spine(clip: Clip, source: dict[str, int]) -> None:
-    """Spines have one to five joints, called differently everywhere: ours are the first, middle and last of the file's."""
-    chain = []
-    at = clip.parents[source["neck"]] if "neck" in source else clip.parents[source["head"]] if "head" in source else -1
-    while at >= 0 and at != source.get("pelvis"):
-        chain.insert(0, at)
-        at = clip.parents[at]
-    last = len(chain) - 1
-    if at >= 0:
-        ours = {"spine3": last, "spine1": 0 if last > 0 else -1, "spine2": last // 2 if last > 1 else -1}
-        source.update({name: chain[i] for name, i in ours.items() if i >= 0})
 
 
 # Rest poses -------------------------------------------------------------------------------------------------------------
@@ -219,6 +166,8 @@ def _body_turns(
         elif name not in source:
             world.append(world[parent])
         elif child is None:
+            if by_motion and name.endswith("_ankle"):  # no toes tell where the foot points: as in T-pose on average
+                align = _mean(_transposed(world[parent]) @ turns[:, source[name]]).T
             world.append(turns[:, source[name]] @ align)
         else:
             bone = unit(joints[_INDEX[child]] - joints[j])
@@ -281,6 +230,12 @@ def _frame(right: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[n
     x = unit(right)
     z = unit(np.cross(x, up))
     return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _mean(turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "3 3"]:
+    quaternions = Rotation.from_matrix(turns).as_quat()
+    signs = np.where(quaternions @ quaternions[0] < 0, -1.0, 1.0)
+    return Rotation.from_quat(signs @ quaternions).as_matrix()
 
 
 def _untwist(turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

@@ -57,34 +57,156 @@ function bvhJoints(text) {
   return joints;
 }
 
-// A Map from each joint of ours that the file has to the index of the file's.
-function matchBvh({ joints }, scene) {
-  let plain = joints.map((j) => j.name.replace(/^.*[:|]/, "").toLowerCase().replace(/[^a-z0-9]/g, ""));
+// A Map from each joint of ours that the file has to the index of the file's: as humangs_jax/data/motion/matching.py. place, posed:
+// in the rest pose and in the first frame.
+function matchBvh(joints, scene, place, posed) {
+  const parents = joints.map((j) => j.parent), plain = plainNames(joints.map((j) => j.name));
+  let source = namedJoints(plain);
+  if (source.has("left_hip") && source.has("right_hip")) {
+    const [one, two] = ["left_hip", "right_hip"].map((name) => ancestors(parents, source.get(name)).slice(1));
+    const common = one.filter((joint) => two.includes(joint));
+    if (common.length && !common.includes(source.get("pelvis"))) source.set("pelvis", common[0]);
+  }
+  const missing = RULES.NEEDED.filter((name) => !source.has(name));
+  if (missing.length || !descends(source, parents)) {
+    const limbs = limbsOfTree(plain, parents, place, posed);
+    if (!limbs) {
+      const what = missing.length ? `no joint for ${missing.join(", ")}` : "joints that do not hang below each other";
+      throw new Error(`${what}: ${RULES.EXPECTED_NAMES}, got ${joints.slice(0, 12).map((j) => j.name).join(", ")}`);
+    }
+    const body = ["pelvis", "neck", "head"];
+    for (const side of RULES.SIDES) for (const name of ["collar", ...RULES.UNDER.flat()]) body.push(`${side}_${name}`);
+    source = new Map([...[...source].filter(([name]) => !body.includes(name)), ...limbs]);
+  }
+  matchToes(source, parents, place);
+  matchHead(source, plain, parents);
+  matchSpine(joints, source);
+  return new Map([...source].filter(([name]) => scene.names.includes(name)));
+}
+
+// Lower case, letters and digits, without what stands in front of all or many of them.
+function plainNames(names) {
+  const plain = names.map((name) => {
+    const words = name.replace(/^.*[:|]/, "").toLowerCase().match(/[a-z0-9]+/g) || [];
+    return words.filter((word) => !RULES.NOISE.includes(word)).join("").replace(/^mixamorig\d*/, "");
+  });
+  const filled = plain.filter(Boolean);
   let start = 0;
-  while (plain.length >= RULES.FEW && plain[0][start] !== undefined && plain.every((name) => name[start] === plain[0][start])) start++;
-  plain = plain.map((name) => name.slice(start).replace(/^mixamorig\d*/, ""));
+  while (filled.length >= RULES.FEW && filled[0][start] !== undefined && filled.every((name) => name[start] === filled[0][start])) start++;
+  return plain.map((name) => name.slice(start));
+}
+
+function namedJoints(plain) {
   const source = new Map(), taken = new Set();
   const find = (ours, theirs) => {
-    if (!scene.names.includes(ours)) return;
     const found = theirs.map((name) => plain.indexOf(name)).find((i) => i >= 0 && !taken.has(i));
     if (found !== undefined) taken.add(found) && source.set(ours, found);
   };
   for (const [ours, theirs] of Object.entries(RULES.MIDDLE)) find(ours, theirs);
   for (const [ours, theirs] of Object.entries(RULES.SIDED))
-    for (const side of RULES.SIDES) find(`${side}_${ours}`, theirs.flatMap((x) => [side + x, side[0] + x, x + side[0]]));
-  matchSpine(joints, scene, source);
-  const missing = RULES.NEEDED.filter((name) => !source.has(name));
-  if (missing.length) throw new Error(`no joint for ${missing.join(", ")}: ${RULES.EXPECTED_NAMES}, got ${joints.slice(0, 12).map((j) => j.name).join(", ")}`);
+    for (const side of RULES.SIDES) find(`${side}_${ours}`, theirs.flatMap((x) => [side + x, side[0] + x, x + side[0], x + side]));
   return source;
 }
 
+function ancestors(parents, joint) {
+  const found = [];
+  for (; joint >= 0; joint = parents[joint]) found.push(joint);
+  return found;
+}
+
+const descends = (source, parents) => RULES.UNDER.every(([a, b]) => RULES.SIDES.every((side) => {
+  const [above, below] = [source.get(`${side}_${a}`), source.get(`${side}_${b}`)];
+  return above === undefined || below === undefined || ancestors(parents, below).slice(1).includes(above);
+}));
+
+// The joints of arms, legs and pelvis by the tree, as entries of a Map; null where it is not one of a person.
+function limbsOfTree(plain, parents, place, posed) {
+  const lengths = parents.map((p, i) => (p < 0 ? 0 : Math.hypot(...subtract(place[i], place[p]))));
+  const children = parents.map((_, i) => parents.flatMap((p, j) => (p === i ? [j] : []))), reach = [...lengths];
+  for (let i = parents.length - 1; i >= 0; i--) reach[i] += Math.max(0, ...children[i].map((child) => reach[child]));
+  const bones = (limb) => [lengths[limb[1]], lengths[limb[2]]], total = (limb) => bones(limb)[0] + bones(limb)[1];
+  const bends = (joint) => {
+    const path = [joint];
+    while (children[path.at(-1)].length) path.push(children[path.at(-1)].reduce((best, child) => (reach[child] > reach[best] ? child : best)));
+    const inner = path.slice(1).map((j) => lengths[j]);
+    if (inner.length < 2) return null;
+    const shorter = inner.slice(1).map((x, i) => Math.min(x, inner[i])), first = shorter.indexOf(Math.max(...shorter));
+    return inner[first] > 0 ? path.slice(first, first + 4) : null;
+  };
+  const alike = (a, b) => Math.max(...bones(a).map((x, i) => Math.abs(x - bones(b)[i]))) <= RULES.LIKE * Math.max(...bones(a), ...bones(b));
+  const longest = (items, size) => items.reduce((best, item) => (best === null || size(item) > size(best) ? item : best), null);
+  const found = parents.flatMap((_, joint) => {
+    const limbs = children[joint].map(bends).filter(Boolean);
+    const pairs = limbs.flatMap((a, i) => limbs.slice(0, i).filter((b) => alike(a, b)).map((b) => [a, b]));
+    const pair = longest(pairs, ([a, b]) => total(a) + total(b));
+    return pair ? [{ joint, pair }] : [];
+  });
+  for (const { joint: pelvis, pair: legs } of found) {
+    const inside = found.filter(({ joint }) => {
+      const above = ancestors(parents, joint);
+      return above.slice(1).includes(pelvis) && !legs.some(([hip]) => above.includes(hip));
+    });
+    if (inside.length) {
+      const { joint: chest, pair: arms } = longest(inside, ({ pair }) => total(pair[0]));
+      return sidedLimbs(plain, parents, posed, pelvis, legs, chest, arms);
+    }
+  }
+  return null;
+}
+
+function sidedLimbs(plain, parents, posed, pelvis, legs, chest, arms) {
+  const toes = legs.filter((leg) => leg.length > 3).map((leg) => subtract(posed[leg[3]], posed[leg[2]]));
+  const left = cross(normalized(subtract(posed[chest], posed[pelvis])), toes.length ? toes.reduce(add) : [0, 0, 1]);
+  const source = [["pelvis", pelvis]];
+  for (const [limbs, names] of [[legs, ["hip", "knee", "ankle", "foot"]], [arms, ["shoulder", "elbow", "wrist"]]]) {
+    let sides = limbs.map((limb) => RULES.SIDES.find((side) => limb.slice(0, 3).every((j) => {
+      const name = plain[j];
+      return [side, side[0]].some((word) => name.startsWith(word) || name.endsWith(word));
+    })));
+    if (!RULES.SIDES.every((side) => sides.includes(side)))
+      sides = dot(posed[limbs[0][0]], left) > dot(posed[limbs[1][0]], left) ? ["left", "right"] : ["right", "left"];
+    limbs.forEach((limb, i) => {
+      names.slice(0, limb.length).forEach((name, k) => source.push([`${sides[i]}_${name}`, limb[k]]));
+      const above = parents[limb[0]];
+      if (limbs === arms && above !== chest) source.push([`${sides[i]}_collar`, above]);
+    });
+  }
+  return source;
+}
+
+function matchToes(source, parents, place) {
+  for (const side of RULES.SIDES) {
+    const ankle = source.get(`${side}_ankle`), far = (i) => Math.hypot(...subtract(place[i], place[ankle]));
+    const below = parents.flatMap((p, i) => (p === ankle && far(i) > 0 ? [i] : []));
+    if (!source.has(`${side}_foot`) && below.length) source.set(`${side}_foot`, below.reduce((best, i) => (far(i) > far(best) ? i : best)));
+  }
+}
+
+// What hangs between the arms: the first joint is the neck, the last the head, but for ends of bones.
+function matchHead(source, plain, parents) {
+  if (source.has("neck") || source.has("head")) return;
+  const arms = RULES.SIDES.map((side) => ancestors(parents, source.get(`${side}_shoulder`)).slice(1));
+  const chest = arms[0].find((joint) => arms[1].includes(joint)), used = new Set(source.values()), chains = [];
+  parents.forEach((p, i) => {
+    if (p !== chest || arms.some((arm) => arm.includes(i)) || used.has(i)) return;
+    const chain = [i], below = (joint) => parents.flatMap((q, j) => (q === joint ? [j] : []));
+    for (let next = below(i); next.length === 1; next = below(next[0])) chain.push(next[0]);
+    while (chain.length > 1 && RULES.ENDS.some((end) => plain[chain.at(-1)].endsWith(end))) chain.pop();
+    chains.push(chain);
+  });
+  if (!chains.length) return;
+  const chain = chains.reduce((best, each) => (each.length > best.length ? each : best));
+  source.set("neck", chain[0]);
+  if (chain.length > 1) source.set("head", chain.at(-1));
+}
+
 // Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
-function matchSpine(joints, scene, source) {
+function matchSpine(joints, source) {
   const found = [];
   let at = joints[source.get("neck") ?? source.get("head")]?.parent ?? -1;
   for (; at >= 0 && at !== source.get("pelvis"); at = joints[at].parent) found.unshift(at);
   const last = found.length - 1, ours = { spine3: last, spine1: last > 0 ? 0 : -1, spine2: last > 1 ? last >> 1 : -1 };
-  for (const [name, i] of Object.entries(ours)) if (at >= 0 && i >= 0 && scene.names.includes(name)) source.set(name, found[i]);
+  for (const [name, i] of Object.entries(ours)) if (at >= 0 && i >= 0) source.set(name, found[i]);
 }
 
 const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
@@ -93,9 +215,9 @@ const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
 // file's, carried down from the pelvis, whose is fixed by the hips' line and the up direction of the spine. Where nobody can stand
 // like the rest pose, twists are 0 on average over the frames.
 function retargetBvh(bvh, scene) {
-  const source = matchBvh(bvh, scene);
   const place = bvh.joints.map(() => [0, 0, 0]);  // rest positions: parents stand before their children
   bvh.joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
+  const own = bvh.frames.map((numbers) => poseBvh(bvh, numbers)), source = matchBvh(bvh.joints, scene, place, own[0].position);
   const between = (a, b) => subtract(place[source.get(b)], place[source.get(a)]), theirs = (a, b) => normalized(between(a, b));
   const rest = (name) => scene.rest[scene.names.indexOf(name)];
   const top = RULES.TOPS.find((name) => source.has(name)), spine = theirs("pelvis", top), tall = nearestAxis(spine).axis;
@@ -104,7 +226,6 @@ function retargetBvh(bvh, scene) {
     const [a, b] = pair.split(">");
     return sum + Math.hypot(...subtract(at(b), at(a)));
   }, 0);
-  const own = bvh.frames.map((numbers) => poseBvh(bvh, numbers));
   const scale = legs(rest) / Math.max(legs((name) => own[0].position[source.get(name)]), 1e-9);  // units, and the length of the steps
   const { up, said } = upOfBvh(own, source, top, scale, standing ? tall : "y", bvh.fps), upright = uprightMatrix(up);
   const posed = own.map(({ world, position }) => (
@@ -125,6 +246,8 @@ function retargetBvh(bvh, scene) {
     const name = scene.names[j], p = scene.parents[j], at = source.get(name);
     const child = p < 0 ? undefined : (NEXT.get(name) || []).find((other) => source.has(other));
     align[j] = p < 0 ? root : align[p];
+    if (!standing && at !== undefined && child === undefined && name.endsWith("_ankle"))  // no toes: as in T-pose on average
+      align[j] = transposed(meanTurn(posed.map(({ world }, f) => matrixMultiply(transposed(global[f][p]), world[at]))));
     if (at === undefined || child === undefined) {  // joints that the file does not have go with their parents
       posed.forEach(({ world }, f) => {
         global[f][j] = p < 0 ? matrixMultiply(pelvis[f], root) : at === undefined ? global[f][p] : matrixMultiply(world[at], align[j]);
@@ -191,6 +314,12 @@ function pelvisTurns(joints, source, place, posed, top) {
   const tilt = tilts(own, chain.find((joint) => far(joint) > 0.01 * far(end)) ?? end);
   if (size(tilt) <= RULES.LARGEST_BEND) return own;
   return own.map((turn, f) => matrixMultiply(matrixFromQuat(quatFromAxisAngle(...scaled(lines[f], tilt[f]))), turn));
+}
+
+function meanTurn(turns) {
+  const quats = turns.map(quatFromMatrix), sum = [0, 0, 0, 0];
+  for (const q of quats) q.forEach((v, i) => { sum[i] += q.reduce((d, x, k) => d + x * quats[0][k], 0) < 0 ? -v : v; });
+  return matrixFromQuat(quatNormalize(sum));
 }
 
 // The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
