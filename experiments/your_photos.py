@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 from experiments.harness import Run, entry
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.frames import images, rest_pose_of, turntable_views
+from humangs_jax.avatar.frames import a_pose_of, images, turntable_views
 from humangs_jax.avatar.sheets import tile
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
@@ -21,7 +21,7 @@ from humangs_jax.io.reading import write_json
 from humangs_jax.people.writer import Layout, write_person
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
-SEED, VIEWS, SIZE, NOISE = 4_000_002, 4, 512, 2.0
+SEED, VIEWS, SIZE, NOISE = 4_000_009, 4, 512, 2.0
 OPENCV_FROM_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 WIDTH = 1200
 """Pixels of a figure."""
@@ -105,7 +105,7 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
     save(tile(rows, labels=labels, columns=VIEWS), IMAGES / "your_photos_material.jpg")
     save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
     avatar, shot = Avatar.load(out / "me" / "avatar.npz"), Shot(size=SIZE)
-    turn = turntable_views(avatar, rest_pose_of(avatar), VIEWS, shot)
+    turn = turntable_views(avatar, a_pose_of(avatar), VIEWS, shot)
     save(tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS), IMAGES / "your_photos_avatar.jpg")
 
 
