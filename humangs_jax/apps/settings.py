@@ -62,8 +62,8 @@ class Settings:
     """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
 
     views: photos that are used at most, chosen by `select_views`; None: all. runtime: of the network. refine_iterations,
-    refine_steps: of refinement, see `RefineConfig`, 0 and 0 for none; refine_size: photos whose longer side is larger are reduced
-    to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
+    refine_steps, head_steps: of refinement, see `RefineConfig`; the first two 0 for none. refine_size: photos whose longer side
+    is larger are reduced to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
     """
 
     views: Few | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
@@ -72,6 +72,9 @@ class Settings:
         0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
     )
     refine_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
+    head_steps: RefineSteps = knob(
+        0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
+    )
     refine_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
@@ -84,7 +87,11 @@ class Settings:
         if not self.refine_iterations and not self.refine_steps:
             return None
         return RefineConfig(
-            iterations=self.refine_iterations, steps=self.refine_steps, seconds=None, image_size=self.refine_size
+            iterations=self.refine_iterations,
+            steps=self.refine_steps,
+            seconds=None,
+            head_steps=self.head_steps,
+            image_size=self.refine_size,
         )
 
     @property
@@ -111,10 +118,10 @@ class Settings:
 
 PRESETS: Presets[Settings] = Presets(
     {
-        "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000, displacement=False), splat="fast"),
+        "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000), splat="fast"),
         "balanced": Settings(
             views=4,
-            runtime=Runtime(crop=True, body_vertices=2000, displacement=False),
+            runtime=Runtime(crop=True, body_vertices=2000),
             refine_iterations=4,
             refine_size=256,
             splat="near_exact",
@@ -410,7 +417,7 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
     """Short runs of refinement, and how often each has to be counted: the iterations, and a few steps for all."""
     few = min(settings.refine_steps, STEPS)
     iterations = dataclasses.replace(settings, refine_steps=0).refinement
-    steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few).refinement
+    steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few, head_steps=0).refinement
     if steps is not None:
         steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
     return [

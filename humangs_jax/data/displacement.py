@@ -10,6 +10,8 @@ body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). On the host, by numpy a
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -61,17 +63,22 @@ PerVertex = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class _View:
-    """One photo: the window around the person. mask: signed distance to the edge, pixels. project: (3, 4) to the window's pixels.
+    """One photo: the window around the person. coverage: by the person. project: (3, 4) to the window's pixels.
 
     linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the photo's corners.
     """
 
-    mask: Float[np.ndarray, "h w"]
+    coverage: Float[np.ndarray, "h w"]
     project: Float[np.ndarray, "3 4"]
     linear: Float[np.ndarray, "n 3 3"]
     offset: Float[np.ndarray, "n 3"]
     low: Float[np.ndarray, "2"]
     high: Float[np.ndarray, "2"]
+
+    @functools.cached_property
+    def mask(self) -> Float[np.ndarray, "h w"]:
+        """Signed distance to the edge of the mask, pixels."""
+        return signed_distance(self.coverage).astype(np.float32)
 
     def seen(self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)) -> tuple:
         """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo shows."""
@@ -156,17 +163,21 @@ def _window(
     x, y = columns / window.shape[1], rows / window.shape[0]
     to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
     low, high = np.asarray([-left * x, -top * y]), np.asarray([(width - left) * x, (height - top) * y])
-    edges = signed_distance(resized(window, columns, rows))
-    return _View(edges.astype(np.float32), to_window @ project, linear, offset, low + NEAR, high - NEAR)
+    return _View(resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR)
 
 
 def _share_outside(views: list[_View], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]) -> float:
-    """Of the free vertices, those that are `OUTSIDE` outside of a mask."""
-    out = np.zeros(len(rest), bool)
-    for view in views:
-        pixels, per_metre, within = view.seen(rest)
-        out |= within & (_at(view.mask, pixels) < -OUTSIDE * per_metre)
-    return float(out[free].mean()) if free.any() else 0.0
+    """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all, these."""
+
+    def share(outside: Callable[[_View, np.ndarray, np.ndarray], np.ndarray]) -> float:
+        found = np.zeros(len(rest), bool)
+        for view in views:
+            pixels, per_metre, within = view.seen(rest)
+            found |= within & outside(view, pixels, per_metre)
+        return float(found[free].mean()) if free.any() else 0.0
+
+    few = share(lambda view, pixels, _: _at(view.coverage, pixels) < MASK_THRESHOLD)  # needs no distances
+    return few if few < MISFIT else share(lambda view, pixels, scale: _at(view.mask, pixels) < -OUTSIDE * scale)
 
 
 def _targets(
