@@ -138,17 +138,23 @@ KEYPOINTS = SourceFormats(
         files=("openpose",),
         content="`--write_json`, a file an image: BODY_25, hands",
     ),
+    easymocap=SourceFormat(
+        "EasyMocap",
+        _KEYPOINTS + "easymocap:read",
+        files=("annots",),
+        content="`annots`, a file an image: BODY_25, hands",
+    ),
     coco=SourceFormat(
         "COCO, COCO-WholeBody or AlphaPose",
         _KEYPOINTS + "coco:read",
         files=("alphapose-results.json", "alphapose.json"),
-        content="results, or images and annotations: 17, 26 or 133 points",
+        content="results, or images and annotations: 17, 26, 133 or 136 points",
     ),
     mmpose=SourceFormat(
         "MMPose",
         _KEYPOINTS + "mmpose:read",
         files=("rtmpose", "mmpose", "predictions"),
-        content="inferencer or demo scripts, a file an image or a video: 17, 26 or 133 points",
+        content="inferencer or demo scripts, a file an image or a video: 17, 26, 133 or 136 points",
     ),
 )
 """Keypoints of detectors; files may be folders."""

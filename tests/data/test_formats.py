@@ -118,7 +118,7 @@ def test_a_suffix_of_its_own_is_for_files_that_are_no_text(tmp_path, made_up):
         KEYPOINTS,
         SourceFormat("Tables", "made_up:read", (".points",)),
         recognizes=lambda source: source.path.suffix == ".points",
-        read=lambda source, format: detections_of([DetectedImage("front", source.path, tuple(9 * point))]),
+        read=lambda source, format: detections_of([DetectedImage("front", source.path, tuple(30 * point))]),
     )
     (tmp_path / "front.points").write_bytes(b"\xff\x00")
     with pytest.raises(CaptureError, match="confidences"):  # it was read

@@ -67,6 +67,15 @@ def test_confidences_a_little_out_of_range_are_clipped(tmp_path, confidence, cli
     assert read(tmp_path / "k.json", [changed(2, confidence)]).confidences[0, 0] == clipped
 
 
+def test_scores_of_another_scale_are_divided_by_the_largest_of_the_file_and_it_is_said(tmp_path):
+    people = [entry(confidence=1.5), entry("back", confidence=6.0)]
+    people[0]["keypoints"][2] = 3.0
+    keypoints = read(tmp_path / "k.json", people)
+    np.testing.assert_allclose(keypoints.confidences[0, :2], [0.5, 0.25])
+    assert (keypoints.confidences[1] == 1).all()
+    assert "scores of up to 6, of another scale than [0, 1]: divided by that" in keypoints.warnings
+
+
 @pytest.mark.parametrize(
     "index, value, kept",
     [

@@ -13,6 +13,7 @@ from humangs_jax.data.keypoints.sets import (
     COCO_17,
     COCO_WHOLEBODY_133,
     HALPE_26,
+    HALPE_136,
     KEYPOINT_SETS,
     MEDIAPIPE_33,
     OPENPOSE_67,
@@ -62,6 +63,17 @@ def openpose(*people):
     return {"version": 1.3, "people": list(people)}
 
 
+def annots(values, filename, number=0):
+    """As EasyMocap writes them; hands beside BODY_25."""
+    hands = {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()} if len(values) == 67 else {}
+    person = {
+        "bbox": [0, 0, 9, 9, 1.0],
+        "personID": number,
+        "keypoints": values[: 25 if hands else None].tolist(),
+    } | hands
+    return {"height": SIZE[1], "width": SIZE[0], "annots": [person]} | ({"filename": filename} if filename else {})
+
+
 def instances(values):
     return [{"keypoints": values[:, :2].tolist(), "keypoint_scores": values[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]}]
 
@@ -104,6 +116,17 @@ FOLDERS = {
         ("front",),
         lambda v: {"front": openpose({"person_id": [-1], "pose_keypoints_2d": flat(v[0])})},
     ),
+    "RTMW's points in OpenPose's form": (
+        COCO_WHOLEBODY_133,
+        ("front",),
+        lambda v: {"front": openpose({"person_id": [-1], "pose_keypoints_2d": flat(v[0])})},
+    ),
+    "EasyMocap": (
+        OPENPOSE_67,
+        CAMERA_NAMES,
+        lambda v: {f"cam{c}/{f:06d}": annots(x, f"images/cam{c}/{f:06d}.jpg") for c, f, x in OF_CAMERAS(v)},
+    ),
+    "EasyMocap, Halpe": (HALPE_136, NAMES, lambda v: {n: annots(x, None) for n, x in OF_NAMES(v)}),
     "OpenPose of one image": (OPENPOSE_67, ("front",), lambda v: {"front_keypoints": openpose(openpose_person(v[0]))}),
     "MMPose": (COCO_17, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
     "MMPose, whole body": (COCO_WHOLEBODY_133, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
@@ -139,6 +162,16 @@ def test_openpose_without_hands(tmp_path):
     check(read(tmp_path), values, OPENPOSE_67)
 
 
+def test_people_of_easymocap_are_chosen_by_their_id(tmp_path):
+    values = known(67)
+    for name, each in zip(NAMES, values, strict=True):
+        content = annots(each, f"{name}.jpg", 1)
+        if name == "front":  # somebody else, in one view alone
+            content["annots"].append(annots(each + [1, 1, 0], "", 0)["annots"][0])
+        write(tmp_path / f"{name}.json", content)
+    check(read(tmp_path, person=1), values, OPENPOSE_67)
+
+
 @pytest.mark.parametrize("tool", ["openpose", "mmpose"])
 def test_nobody_is_found_in_a_view(tool, tmp_path):
     values = known(67 if tool == "openpose" else 17)
@@ -154,7 +187,7 @@ def test_nobody_is_found_in_a_view(tool, tmp_path):
 # COCO ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("keypoint_set", [COCO_17, HALPE_26, COCO_WHOLEBODY_133])
+@pytest.mark.parametrize("keypoint_set", [COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136])
 @pytest.mark.parametrize("key", ["image_id", "file_name"])
 def test_coco_results_and_alphapose_by_name(tmp_path, keypoint_set, key):
     values = known(len(keypoint_set.names))

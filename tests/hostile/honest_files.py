@@ -206,6 +206,12 @@ def openpose():
     return json.dumps({"version": 1.3, "people": [{"pose_keypoints_2d": values.ravel().tolist()}]})
 
 
+def annots():
+    values = person(25)
+    values[:, 2] = 0.9
+    return json.dumps({"filename": "000.jpg", "annots": [{"personID": 0, "keypoints": values.tolist()}]})
+
+
 def coco():
     values = person(17)
     values[:, 2] = 0.9

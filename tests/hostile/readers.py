@@ -203,6 +203,7 @@ ROWS = {
     "colmap": (read_cameras, honest.write_colmap, "images.txt"),
     "import": (import_into, honest.write_import),
     "openpose": (read_detections, written("000_keypoints.json", honest.openpose)),
+    "easymocap annots": (read_detections, written("000.json", honest.annots)),
     "coco": (read_detections, written("results.json", honest.coco)),
     "coco annotations": (read_detections, written("annotations.json", honest.coco_annotations)),
     "mmpose": (read_detections, written("walk.json", honest.mmpose)),

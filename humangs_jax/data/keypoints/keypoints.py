@@ -40,6 +40,8 @@ class Keypoints:
     not_finite: int = 0
     far_outside: int = 0
     shifted: str = ""
+    largest: float = 1.0
+    """Of the scores of the file, by which they were divided; 1 where they were in [0, 1]."""
     world: Float[np.ndarray, "v k 3"] | None = None
 
     @property
@@ -53,6 +55,8 @@ class Keypoints:
             found.append(
                 f"frames and photos are counted from different numbers and were matched in order: {self.shifted}"
             )
+        if self.largest > 1:
+            found.append(f"scores of up to {self.largest:.4g}, of another scale than [0, 1]: divided by that")
         if self.not_finite:
             found.append(f"{self.not_finite} keypoints are not finite numbers and are ignored")
         if self.far_outside:

@@ -1,6 +1,6 @@
 """OpenPose's --write_json: NAME_keypoints.json, {people: [{pose_keypoints_2d, hand_left_keypoints_2d, ...}]}, a file an image.
 
-RTMPose's 26 points of Halpe, without hands, come in the same form (Pose2Sim, RTMLib).
+RTMPose's 17, 26, 133 or 136 points, in one list, come in the same form (Pose2Sim, RTMLib).
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, expect, members
 from humangs_jax.data.formats import SourceFormat
 from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Source, triples
-from humangs_jax.data.keypoints.sets import HALPE_26, OPENPOSE_67
+from humangs_jax.data.keypoints.sets import OPENPOSE_67, SETS_BY_COUNT
 
 SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
@@ -31,7 +31,7 @@ def read(source: Source, format: SourceFormat) -> Detections:
     """The people of one image. Raises: CaptureError."""
     (entries,) = members(source.json, source.path, people=list)
     people = [_person(entry, source.path, f"people[{i}]") for i, entry in enumerate(entries)]
-    kind = HALPE_26 if any(len(each) == len(HALPE_26.names) for each in people) else OPENPOSE_67
+    kind = next((SETS_BY_COUNT[len(each)] for each in people if len(each) in SETS_BY_COUNT), OPENPOSE_67)
     if odd := [i for i, each in enumerate(people) if len(each) != len(kind.names)]:
         raise CaptureError(source.path, f"people[{odd[0]}]", f"not of the {kind.name} points of another person")
     image = DetectedImage(source.name.removesuffix(SUFFIX), source.path, tuple(people))
@@ -40,8 +40,8 @@ def read(source: Source, format: SourceFormat) -> Detections:
 
 def _person(person: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:
     (body,) = members(person, file, field, pose_keypoints_2d=list)
-    if len(body) == 3 * len(HALPE_26.names):
-        return triples(body, file, f"{field}.pose_keypoints_2d", len(HALPE_26.names))
+    if len(body) % 3 == 0 and len(body) // 3 in SETS_BY_COUNT:
+        return triples(body, file, f"{field}.pose_keypoints_2d")
     return np.concatenate([_part(person.get(key, []), file, f"{field}.{key}", n) for key, n in PARTS.items()])
 
 

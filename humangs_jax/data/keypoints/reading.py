@@ -18,8 +18,9 @@ from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
 """If no coordinate of any view reaches this many pixels, they are no pixels but shares of the image."""
-LARGEST_CONFIDENCE = 2.0
-"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0; what is beyond 2 or -1 is on another scale."""
+OVERSHOOT, LARGEST_SCORE = 1.1, 20.0
+"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of another scale, such as the maxima of
+SimCC heads (RTMPose, RTMW, DWPose), and are divided by the largest of the file; those beyond that are no scores."""
 SMALLEST_CONFIDENCE = -1.0
 CLEAR_CONFIDENCE, CLEAR_SHARE = 0.3, 0.25
 """A detection of more than this mean confidence and share of the points of `TRUNK_AND_LIMBS` is a person, others are a detector's
@@ -83,7 +84,7 @@ def _amount(content: Any) -> int:
     """How many people and images a JSON file has, before any is looked at."""
     lists = [content]
     if isinstance(content, dict):
-        lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info")]
+        lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info", "annots")]
     entries = [entry for each in lists if isinstance(each, list) for entry in each]
     keys = ("instances", "people")
     inside = [entry[key] for entry in entries if isinstance(entry, dict) for key in keys if key in entry]
@@ -121,11 +122,14 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
     body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
+    largest = _largest_score(detections)
     columns = max((each.shape[1] for image in detections.images for each in image.people), default=3)
     people, most, nobody = [], 0, Person(np.zeros((len(kind.names), columns)))
     for image, name in zip(images, names, strict=True):
         seen = () if image is None else image.people
-        found = [_usable(each, detections.offset, width, height, image, name) for each in seen if image is not None]
+        found = [
+            _usable(each, largest, detections.offset, width, height, image, name) for each in seen if image is not None
+        ]
         most = max(most, len(found))
         if (
             image is not None
@@ -150,6 +154,7 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         not_finite=sum(each.not_finite for each in people),
         far_outside=sum(each.far_outside for each in people),
         shifted=_shifted(images, names),
+        largest=largest,
         world=values[..., 3:] if columns > 3 else None,
     )
     _check_pixels(path, keypoints)
@@ -213,17 +218,31 @@ def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
     return len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
 
 
+def _largest_score(detections: Detections) -> float:
+    """Of all people, if it is beyond what heat maps overshoot; else 1."""
+    scores = [person[:, 2] for image in detections.images for person in image.people if len(person)]
+    known = np.concatenate(scores) if scores else np.zeros(0)
+    largest = float(known[np.isfinite(known)].max(initial=0.0))
+    return largest if largest > OVERSHOOT else 1.0
+
+
 def _usable(
-    values: Float[np.ndarray, "k columns"], offset: float, width: int, height: int, image: DetectedImage, view: str
+    values: Float[np.ndarray, "k columns"],
+    largest: float,
+    offset: float,
+    width: int,
+    height: int,
+    image: DetectedImage,
+    view: str,
 ) -> Person:
     """Raises: CaptureError if confidences are not in [0, 1]."""
     finite = np.logical_and.reduce(np.isfinite(values), axis=1)
     known = values[np.isfinite(values[:, 2]), 2]
-    if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_CONFIDENCE):
+    if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_SCORE):
         got = f"{known.min():.4g} to {known.max():.4g}"
         raise CaptureError(image.file, f"view {view}", f"expected confidences in [0, 1], got {got}")
     values = np.where(finite[:, None], np.clip(values, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
-    points, confidences = values[:, :2] + offset, np.clip(values[:, 2], 0, 1)
+    points, confidences = values[:, :2] + offset, np.clip(values[:, 2] / largest, 0, 1)
     far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
     usable = np.column_stack([points, np.where(far, 0, confidences), values[:, 3:]])
     return Person(usable, int((~finite).sum()), int(far.sum()))

@@ -113,6 +113,12 @@ HALPE_26 = _keypoint_set(
 )
 """Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
 
+HALPE_136 = _keypoint_set(
+    "halpe136",
+    (*HALPE_26.names, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right")),
+)
+"""Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
+
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
@@ -152,7 +158,9 @@ MEDIAPIPE_33 = _keypoint_set(
 )
 """MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
 
-KEYPOINT_SETS = {each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, OPENPOSE_67, MEDIAPIPE_33)}
+KEYPOINT_SETS = {
+    each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_67, MEDIAPIPE_33)
+}
 """The sets by name, as our npz files name them."""
-SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133)}
+SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)}
 """The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
