@@ -167,7 +167,7 @@ def test_people_of_easymocap_are_chosen_by_their_id(tmp_path):
     for name, each in zip(NAMES, values, strict=True):
         content = annots(each, f"{name}.jpg", 1)
         if name == "front":  # somebody else, in one view alone
-            content["annots"].append(annots(each + [1, 1, 0], "", 0)["annots"][0])
+            content["annots"].append(annots(np.add(each, [1, 1, 0]), "", 0)["annots"][0])
         write(tmp_path / f"{name}.json", content)
     check(read(tmp_path, person=1), values, OPENPOSE_67)
 
