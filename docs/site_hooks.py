@@ -16,7 +16,12 @@ def on_page_markdown(markdown: str, **_: object) -> str:
     """Called by mkdocs for the text of every page."""
     if COMMANDS in markdown:
         markdown = markdown.replace(COMMANDS, commands())
-    return OUTSIDE.sub(lambda link: link[1] if f"`{link[2]}`" == link[1] else f"{link[1]} (`{link[2]}`)", markdown)
+    return OUTSIDE.sub(_named, markdown)
+
+
+def _named(link: re.Match[str]) -> str:
+    """The text of a link with its file, once."""
+    return f"`{link[2]}`" if link[2].endswith(link[1].strip("`")) else f"{link[1]} (`{link[2]}`)"
 
 
 def commands() -> str:
