@@ -218,7 +218,7 @@ def fitted_capture(photos, body, seed, kind, noise_px, outliers):
     """The capture with a fitted body, and its mean joint error."""
     keypoint_set = KEYPOINT_SETS[kind]
     model = landmark_model(body, keypoint_set.names)
-    landmarks, joints = pose_landmarks(model, photos.betas, photos.pose(0))
+    landmarks, joints = pose_landmarks(model, jnp.asarray(photos.betas), photos.pose(0))
     K, pose = np.asarray(photos.cameras.K)[None], np.asarray(photos.cameras.cam_from_world)[None]
     rotations, translations = np.asarray(photos.poses.rotations), np.asarray(photos.poses.translation)
     truth = (np.asarray(x)[None] for x in (joints, landmarks))
