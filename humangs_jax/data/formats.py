@@ -90,10 +90,10 @@ _CAMERAS, _KEYPOINTS = "humangs_jax.data.calibration.", "humangs_jax.data.keypoi
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
-        "COLMAP text model",
+        "COLMAP",
         _CAMERAS + "colmap:read",
         files=tuple(place + name for place in _MODELS for name in ("images.txt", "cameras.txt", "images.bin")),
-        content="SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV; a binary model has to be converted first",
+        content="text or binary: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
         folder=True,
         pixel_centers="half",
         per_image=True,
@@ -115,10 +115,31 @@ CAMERAS = SourceFormats(
         pixel_centers="half",
         per_image=True,
     ),
+    toml=CameraFormat(
+        "Caliscope, Anipose or Pose2Sim",
+        _CAMERAS + "toml:read",
+        (".toml",),
+        files=("camera_array.toml", "calibration.toml", "Calib*.toml"),
+        content="TOML: `matrix`, `distortions`, `rotation`, `translation`, `size` in a table of each camera",
+        up="+z",
+    ),
+    qualisys=CameraFormat(
+        "Qualisys",
+        _CAMERAS + "qualisys:read",
+        files=("*.qca.txt",),
+        content="XML: `transform`, `fov_video`, `intrinsic` of each camera",
+        up="+z",
+    ),
+    panoptic=CameraFormat(
+        "CMU Panoptic",
+        _CAMERAS + "panoptic:read",
+        files=("calibration_[0-9]*.json",),
+        content="JSON: a list `cameras` of `K`, `distCoef`, `R`, `t`, `resolution`",
+    ),
     opencv=CameraFormat(
         "OpenCV, AvatarReX or THuman4.0",
         _CAMERAS + "opencv:read",
-        files=("calibration_full.json", "calibration.json"),
+        files=("calibration_full.json", "calibration.json", "calibration_shelf.json"),
         content="YAML or JSON: `K`, `R`, `T` in a map of each camera, or `K_NAME`, `R_NAME`, `T_NAME`; lens as `dist...` or "
         "`D`, size as `imgSize`, `image_size` or `width`, `height`",
     ),

@@ -290,12 +290,12 @@ def mutated_safetensors(data, draw):
 KINDS = {
     mutated_npz: "npz, smplx npz, hands, body, avatar, keypoints npz, motion npz, amass, thuman, human3r, smplcodec, sam 3d, "
     "joints npz, fit record, bank, video poses, scene arrays",
-    mutated_json: "easymocap motion, easymocap annots, json, configuration, transforms, opencv json, openpose, coco, "
-    "coco annotations, "
-    "mmpose, lhm, joints json, manifest, capture, photos, boundary, import, avatarrex, scene list, evaluation, preprocessed set, "
-    "preprocessed scene, skipped subject",
+    mutated_json: "panoptic, shelf, easymocap motion, easymocap annots, json, configuration, transforms, opencv json, openpose, "
+    "coco, coco annotations, mmpose, lhm, joints json, manifest, capture, photos, boundary, import, avatarrex, "
+    "scene list, evaluation, preprocessed set, preprocessed scene, skipped subject",
     mutated_pickle: "pickle, smplx pkl, aist, phalp, thuman fit",
-    mutated_text: "opencv yaml, easymocap, colmap, obj, off, log, bvh, missing photos, actorshq, thuman mesh, thuman scan",
+    mutated_text: "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, missing photos, actorshq, thuman mesh, "
+    "thuman scan",
     mutated_png: "image",
     mutated_zip: "torch zip, gvhmr",
     mutated_glb: "glb, glb motion",

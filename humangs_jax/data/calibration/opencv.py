@@ -25,6 +25,7 @@ from humangs_jax.data.calibration.calibration import (
     Source,
     brown_conrady,
     image_size,
+    intrinsics,
     pose_matrix,
     rotation,
 )
@@ -53,7 +54,7 @@ def read(source: Source, format: CameraFormat) -> Calibration:
     if not nested:
         return source.calibration(format, flat_cameras(values, values, (file, file), values.get("names")))
     before = lambda name: lambda key: f"{name}.{key}"
-    cameras = [_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
+    cameras = [one_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
     return source.calibration(format, cameras)
 
 
@@ -75,7 +76,7 @@ def flat_cameras(
         raise CaptureError(files[0], "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME")
     behind = lambda name: lambda key: f"{key}_{name}"
     own = lambda values, name: _of_camera(values, name, names)
-    return [_camera(str(name), own(inner, name), own(outer, name), files, behind(name)) for name in names]
+    return [one_camera(str(name), own(inner, name), own(outer, name), files, behind(name)) for name in names]
 
 
 def _names(values: Mapping[str, Any]) -> list[str]:
@@ -90,10 +91,12 @@ def _of_camera(values: Mapping[str, Any], name: object, names: list[Any]) -> dic
     return {key[: -len(end)]: value for key, value in own.items()}
 
 
-def _camera(
+def one_camera(
     name: str, inner: Mapping[str, Any], outer: Mapping[str, Any], files: tuple[Path, Path], field: Callable[[str], str]
 ) -> CalibratedCamera:
     """A camera of its intrinsic and extrinsic values, and their files. `field` makes keys those of the file, for errors."""
+    if "K" not in inner and {"fx", "fy", "cx", "cy", "T", "R"} <= inner.keys():
+        inner = outer = _of_shelf(inner, files[0], field)
     inner_file, outer_file = files
     turn_key = "Rot" if "Rot" in outer else "R"  # EasyMocap has both: the matrix and the rotation vector
     for key, values, file in (("K", inner, inner_file), (turn_key, outer, outer_file), ("T", outer, outer_file)):
@@ -105,6 +108,20 @@ def _camera(
     distortion = _distortion(inner, inner_file, field)
     width, height = _size(inner, inner_file, field)
     return CalibratedCamera(name, K, pose_matrix(turn, translation), width, height, distortion)
+
+
+def _of_shelf(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> dict[str, Any]:
+    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is where the camera stands."""
+    fx, fy, cx, cy = (float(floats(values[key], file, field(key), ())) for key in ("fx", "fy", "cx", "cy"))
+    turn = rotation(values["R"], file, field("R"))
+    place = floats(np.ravel(values["T"]).tolist(), file, field("T"), (3,))
+    lens = {}
+    if "k" in values:
+        k = floats(np.ravel(values["k"]).tolist(), file, field("k"), (3,))
+        p = floats(np.ravel(values.get("p", [0, 0])).tolist(), file, field("p"), (2,))
+        lens = {"dist": [k[0], k[1], p[0], p[1], k[2]]}
+    others = {key: value for key, value in values.items() if key not in ("k", "p")}
+    return others | lens | {"K": intrinsics(fx, fy, cx, cy), "R": turn, "T": -turn @ place}
 
 
 def _distortion(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> Float[np.ndarray, "5"] | None:

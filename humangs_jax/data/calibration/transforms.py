@@ -34,6 +34,8 @@ from humangs_jax.io.reading import shown
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 MASK_KEYS = ("fg_mask_path", "mask_path")
 """Of VHAP and of nerfstudio."""
+MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
+"""Keys of a whole K, of a frame or of the file."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -83,7 +85,7 @@ def _frame_camera(
     if "w" in values or "h" in values:
         size = [required(values, key, file, prefix) for key in ("w", "h")]
         width, height = image_size(size, file, f"{prefix}w, h")
-    elif {"fl_x", "cx", "cy"} <= values.keys():
+    elif {"fl_x", "cx", "cy"} <= values.keys() or not values.keys().isdisjoint(MATRICES):
         width, height = None, None
     else:
         width, height = photo_size(name)
@@ -119,6 +121,9 @@ def _intrinsics(
     values: Mapping[str, Any], width: int | None, height: int | None, file: Path, prefix: str
 ) -> Float[np.ndarray, "3 3"]:
     """K; square pixels and a centred axis where the file does not say otherwise."""
+    key = next((key for key in MATRICES if key in values), None)
+    if key is not None and "fl_x" not in values:
+        return floats(values[key], file, f"{prefix}{key}", (3, 3))
     focal = {}
     for axis, side in (("x", width), ("y", height)):
         if f"fl_{axis}" in values:
@@ -126,7 +131,7 @@ def _intrinsics(
         elif f"camera_angle_{axis}" in values and side is not None:
             focal[axis] = 0.5 * side / np.tan(0.5 * _number(values, f"camera_angle_{axis}", file, prefix))
     if not focal:
-        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x")
+        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x, camera_angle_x or K")
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
     assert {"cx", "cy"} <= values.keys() or None not in (width, height)  # the caller has asked the photo
     cx, cy = (
