@@ -9,7 +9,7 @@ import pytest
 from command_line import save_tiny_avatar
 
 from humangs_jax import cli
-from humangs_jax.apps import many
+from humangs_jax.avatar import reconstruct as many
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.io.images import write_png
 

@@ -5,7 +5,8 @@ Programs are compiled once per bucket: numbers of views and of foreground tokens
 """
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +45,8 @@ from humangs_jax.rendering.splatting import round_up
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
+BATCH = 8
+"""Captures of `reconstruct_many` at a time: beyond it memory grows, and little else."""
 
 
 @checked_arguments
@@ -108,6 +111,59 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
     body, views, config, turned = _stacked(config, captures)
     avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
     return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(avatars, turned, strict=True)]
+
+
+class Reconstructed(NamedTuple):
+    """A capture by name with its avatar, or with what is wrong with it."""
+
+    name: str
+    capture: Capture | None
+    avatar: Avatar | None
+    error: Exception | None = None
+
+
+def reconstruct_many(
+    variables: PyTree, config: HumanGSConfig, captures: Mapping[str, Callable[[], Capture]], batch: int | None = None
+) -> Iterator[Reconstructed]:
+    """Yields the avatar of each capture, in their order; `batch` captures at a time are read and reconstructed by one `vmap`. A
+    capture that cannot be used does not stop the others.
+
+    Arguments: captures: functions that load one each, by its name; ValueError and OSError that they raise are yielded.
+    batch: None for `BATCH`.
+    """
+    names, batch = list(captures), batch or BATCH
+    for start in range(0, len(names), batch):
+        done = [_loaded(name, captures[name]) for name in names[start : start + batch]]
+        good = [each.capture for each in done if each.capture is not None]
+        avatars: list[Avatar | Exception] = []
+        if len(good) > 1:
+            try:
+                avatars = list(reconstruct_batch(variables, config, good))
+            except ValueError:  # of one of them: which one is found below
+                avatars = []
+        avatars = avatars or [_alone(variables, config, capture) for capture in good]
+        following = iter(avatars)
+        for each in done:
+            if each.capture is None:
+                yield each
+            elif isinstance(result := next(following), Avatar):
+                yield each._replace(avatar=result)
+            else:
+                yield each._replace(error=result)
+
+
+def _loaded(name: str, load: Callable[[], Capture]) -> Reconstructed:
+    try:
+        return Reconstructed(name, load(), None)
+    except (ValueError, OSError) as error:
+        return Reconstructed(name, None, None, error)
+
+
+def _alone(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar | Exception:
+    try:
+        return reconstruct(variables, config, capture)
+    except ValueError as error:
+        return error
 
 
 @checked_arguments

@@ -128,7 +128,7 @@ class Reconstruct:
             raise UsageError(f"--out {out}: expected a folder for the avatars of several captures")
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
-            from humangs_jax.apps.many import reconstruct_many
+            from humangs_jax.avatar.reconstruct import reconstruct_many
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 

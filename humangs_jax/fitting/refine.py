@@ -31,13 +31,13 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
+from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, how_far, limit_violations
 from humangs_jax.fitting.residuals.keypoints import (
     NEAR,
     Observations,
     found_noise,
     keypoint_residuals,
-    make_observations,
+    scaled_observations,
 )
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
@@ -68,7 +68,6 @@ from humangs_jax.fitting.state import (
     zero_state,
 )
 from humangs_jax.fitting.triangulation import reprojection_errors
-from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 
 LEAST_NOISE = 0.7
@@ -278,8 +277,8 @@ class Scene:
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        self.keypoints = None if keypoints is None else _observations(capture.cameras, keypoints, 1.0)
-        self.observations = None if keypoints is None else _observations(self.cameras, keypoints, self.scale)
+        self.keypoints = None if keypoints is None else scaled_observations(capture.cameras, keypoints, 1.0)
+        self.observations = None if keypoints is None else scaled_observations(self.cameras, keypoints, self.scale)
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
 
@@ -397,15 +396,6 @@ def _person_height(
     return float(np.median(sizes)) if sizes else float("nan")
 
 
-def _observations(cameras: Camera, keypoints: Keypoints, scale: float) -> Observations:
-    """Keypoints of images of another scale: a batch of views, each with one view (c = 1)."""
-    points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
-    arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
-    seen = make_observations(*(x[None] for x in arrays))
-    by_view = {name: getattr(seen, name)[0][:, None] for name in ("points", "confidences", "K", "cam_from_world")}
-    return replace(seen, **by_view, noise=jnp.broadcast_to(seen.noise, (len(points),)))
-
-
 LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
 """Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of clothes are fitted a little better
 by wrong bodies: for four people who started at the truth, by up to 0.15; keypoints show that.
@@ -502,23 +492,3 @@ def _report(
         notes=tuple(notes),
         warnings=tuple(warnings),
     )
-
-
-def how_far(start: Capture, refined: Capture) -> dict[str, float]:
-    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm; joint_degrees of the joints'
-    rotations, transl_cm of the root.
-    """
-    a, b = start.cameras, refined.cameras
-    product = functools.partial(jnp.matmul, precision=EXACT)
-    relative = product(b.cam_from_world[:, :3, :3], jnp.swapaxes(a.cam_from_world[:, :3, :3], -1, -2))
-    joints = lambda capture: quaternion.matrix_from_axis_angle(capture.poses.rotations)
-    between = product(jnp.swapaxes(joints(start), -1, -2), joints(refined))
-    length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
-    degrees = lambda rotations: np.degrees(length(quaternion.to_axis_angle(quaternion.from_matrix(rotations))))
-    return {
-        "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
-        "camera_degrees": float(degrees(relative)),
-        "camera_cm": 100 * length(b.center - a.center),
-        "joint_degrees": float(degrees(between)),
-        "transl_cm": 100 * length(refined.poses.translation - start.poses.translation),
-    }

@@ -4,18 +4,22 @@
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import FINGERS, BodyPose
+from humangs_jax.body.model import EXACT, FINGERS, BodyPose
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.progress import text_table
+from humangs_jax.data.capture import Capture
 from humangs_jax.fitting.solve import Outcome
 from humangs_jax.fitting.state import pose_prior, violations
 from humangs_jax.fitting.swaps import Swap
+from humangs_jax.geometry import quaternion
 
 ROWS = 24
 """Views in the printed table; of more, those that fit worst."""
@@ -276,3 +280,23 @@ def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
     """The least and the greatest value of a field, or the one value if they are equal."""
     ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
+def how_far(start: Capture, refined: Capture) -> dict[str, float]:
+    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm; joint_degrees of the joints'
+    rotations, transl_cm of the root.
+    """
+    a, b = start.cameras, refined.cameras
+    product = functools.partial(jnp.matmul, precision=EXACT)
+    relative = product(b.cam_from_world[:, :3, :3], jnp.swapaxes(a.cam_from_world[:, :3, :3], -1, -2))
+    joints = lambda capture: quaternion.matrix_from_axis_angle(capture.poses.rotations)
+    between = product(jnp.swapaxes(joints(start), -1, -2), joints(refined))
+    length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
+    degrees = lambda rotations: np.degrees(length(quaternion.to_axis_angle(quaternion.from_matrix(rotations))))
+    return {
+        "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
+        "camera_degrees": float(degrees(relative)),
+        "camera_cm": 100 * length(b.center - a.center),
+        "joint_degrees": float(degrees(between)),
+        "transl_cm": 100 * length(refined.poses.translation - start.poses.translation),
+    }

@@ -162,40 +162,33 @@ def main():
     parser.add_argument("--page", type=Path, help="page whose table kills is written, with its docs/results/kills.json")
     parser.add_argument("--interrupts", type=int, help="number of interrupts of each command, instead of kills")
     arguments = parser.parse_args()
+    folder, names, record = arguments.folder, arguments.commands, arguments.json
     if arguments.interrupts is not None:
-        figures = interrupt_all(arguments.folder, arguments.interrupts, arguments.commands, arguments.json)
-        if arguments.page is not None:
-            publish_interrupts(arguments.page, figures)
-        sys.exit(any(each["faults"] for each in figures.values()))
-    figures = kill_all(arguments.folder, arguments.moments, arguments.commands, arguments.json, arguments.seed)
+        table, figures = "interrupts", interrupt_all(folder, arguments.interrupts, names, record)
+    else:
+        table, figures = "kills", kill_all(folder, arguments.moments, names, record, arguments.seed)
     if arguments.page is not None:
-        write_page(arguments.page, figures)
+        write_page(arguments.page, table, figures)
     sys.exit(any(each["faults"] for each in figures.values()))
 
 
-def publish_interrupts(page: Path, figures: dict[str, dict]) -> None:
+def write_page(page: Path, table: str, figures: dict[str, dict]) -> None:
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from experiments.results import markdown_table, publish
 
     total = lambda key: sum(each[key] for each in figures.values())
-    fewest = min(each["interrupted"] for each in figures.values())
-    header = ["commands that write", "interrupted, exit 130", "fewest of a command", "came to their end before"]
-    header += ["another exit status, left something, or the next run failed"]
-    faults = sum(len(each["faults"]) for each in figures.values())
-    rows = [[len(figures), f"{total('interrupted'):,}", fewest, total("came_to_their_end"), faults]]
-    publish(page, "interrupts", markdown_table(header, rows, "r" * len(header)), figures)
-
-
-def write_page(page: Path, figures: dict[str, dict]) -> None:
-    sys.path.insert(0, str(Path(__file__).parents[2]))
-    from experiments.results import markdown_table, publish
-
-    total = lambda key: sum(each[key] for each in figures.values())
-    header = ["commands that write", "changes of files in one run", "killed", "left a temporary name"]
-    header += ["half-written, lost, or the next run failed"]
-    faults = sum(len(each["faults"]) for each in figures.values())
-    rows = [[len(figures), total("changes_of_files"), total("killed"), total("left_something"), faults]]
-    publish(page, "kills", markdown_table(header, rows, "r" * len(header)), figures)
+    row = {"commands that write": len(figures)}
+    if table == "kills":
+        row |= {"changes of files in one run": total("changes_of_files"), "killed": total("killed")}
+        row |= {"left a temporary name": total("left_something")}
+        fault = "half-written, lost, or the next run failed"
+    else:
+        fewest = min(each["interrupted"] for each in figures.values())
+        row |= {"interrupted, exit 130": f"{total('interrupted'):,}", "fewest of a command": fewest}
+        row |= {"came to their end before": total("came_to_their_end")}
+        fault = "another exit status, left something, or the next run failed"
+    row[fault] = sum(len(each["faults"]) for each in figures.values())
+    publish(page, table, markdown_table(list(row), [list(row.values())], "r" * len(row)), figures)
 
 
 if __name__ == "__main__":

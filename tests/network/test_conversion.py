@@ -1,19 +1,18 @@
 import dataclasses
 import os
 import re
-import sys
 
 import jax
 import network_oracle as oracle
 import numpy as np
 import pytest
+from command_line import run
 from network_cases import random_variables
 from network_golden import CHECKPOINT
 from network_oracle import Options
 from safetensors.numpy import save_file
 from torch_writer import FakeTensor, tensors, write_checkpoint
 
-from humangs_jax import cli
 from humangs_jax.losses.loss_networks import expected_tensors, load_lpips
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.conversion import (
@@ -201,22 +200,11 @@ REFUSED = {
 }
 
 
-def convert(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["humangs", "convert", *map(str, arguments)])
-    try:
-        cli.main()
-        code = 0
-    except SystemExit as exit_:
-        code = exit_.code
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
-
-
 @pytest.mark.parametrize("case", REFUSED)
 def test_the_command_refuses_by_name_and_writes_nothing(case, tmp_path, monkeypatch, capsys):
     spoil, message = REFUSED[case]
     path = write(tmp_path, spoil(oracle.random_state(Options())))
-    code, out, error = convert(monkeypatch, capsys, path, "--out", tmp_path / "w.safetensors")
+    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", tmp_path / "w.safetensors")
     assert code == 1 and out == "" and error.count("\n") == 1 and message in error and "a.pt" in error
     assert os.listdir(tmp_path) == ["a.pt"]
 
@@ -227,7 +215,7 @@ def test_the_command_refuses_code(tmp_path, monkeypatch, capsys):
             return os.mkdir, (str(tmp_path / "owned"),)
 
     path = write(tmp_path, oracle.random_state(Options()), lr_scheduler=Evil())
-    code, _, error = convert(monkeypatch, capsys, path, "--out", tmp_path / "w.safetensors")
+    code, _, error = run(monkeypatch, capsys, "convert", path, "--out", tmp_path / "w.safetensors")
     assert code == 1 and error.count("\n") == 1 and "refused to load" in error and ".mkdir" in error
     assert os.listdir(tmp_path) == ["a.pt"]
 
@@ -240,7 +228,9 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     }
     path = write_checkpoint(tmp_path / "a.pt", {"model": tensors(state) | losses, "optimizer": {}})
     weights = tmp_path / "w.safetensors"
-    code, out, error = convert(monkeypatch, capsys, path, "--out", weights, "--head-width", "4", "--pool", "visible")
+    code, out, error = run(
+        monkeypatch, capsys, "convert", path, "--out", weights, "--head-width", "4", "--pool", "visible"
+    )
     assert code == 0, error
     assert "skipped 2 tensors" in out and "loss_computer" in out and "4 layers of 4 heads" in out
     variables, config = load_weights(weights)
@@ -249,12 +239,12 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     assert config.with_conventions(pool="all") == converted.config.trained
     leaves = zip(*map(jax.tree.leaves, (variables, converted.variables)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
-    code, _, error = convert(monkeypatch, capsys, weights, "--out", tmp_path / "again.safetensors")
+    code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", tmp_path / "again.safetensors")
     assert code == 1 and "a weights file already" in error
     for arguments in ((path, "--out", tmp_path / "w.npz"), (path, "--out", tmp_path / "no" / "w.safetensors")):
-        code, _, error = convert(monkeypatch, capsys, *arguments)
+        code, _, error = run(monkeypatch, capsys, "convert", *arguments)
         assert code == 2 and error.count("\n") == 1
-    code, _, error = convert(monkeypatch, capsys, weights, "--out", weights)
+    code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", weights)
     assert code == 2 and "is read by this command" in error
     assert sorted(os.listdir(tmp_path)) == ["a.pt", "w.safetensors"]
 
@@ -272,7 +262,7 @@ def loss_networks():
 def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
     losses, weights, networks = tmp_path / "losses.safetensors", tmp_path / "w.safetensors", loss_networks()
     path = write(tmp_path, oracle.random_state(Options()) | networks)
-    code, out, error = convert(monkeypatch, capsys, path, "--out", weights, "--losses", losses)
+    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", weights, "--losses", losses)
     assert code == 0 and f"{losses}: LPIPS squeeze" in out and "skipped" not in out, error
     assert sorted(os.listdir(tmp_path)) == ["a.pt", "losses.safetensors", "w.safetensors"]
     kernel = load_lpips("squeeze", losses).backbone["3.squeeze"].kernel
@@ -292,7 +282,7 @@ def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
 def test_losses_that_cannot_be_kept(name, message, tmp_path, monkeypatch, capsys):
     path = write(tmp_path, oracle.random_state(Options()))
     arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / name)
-    code, out, error = convert(monkeypatch, capsys, path, *arguments)
+    code, out, error = run(monkeypatch, capsys, "convert", path, *arguments)
     assert (
         code == (1 if "a.pt" in message else 2) and out == "" and error.count("\n") == 1 and re.search(message, error)
     )
@@ -302,6 +292,6 @@ def test_losses_that_cannot_be_kept(name, message, tmp_path, monkeypatch, capsys
 def test_parts_of_loss_networks_are_refused(tmp_path, monkeypatch, capsys):
     """The golden checkpoint carries four stubs of tensors."""
     arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / "losses.safetensors")
-    code, _, error = convert(monkeypatch, capsys, CHECKPOINT, *arguments)
+    code, _, error = run(monkeypatch, capsys, "convert", CHECKPOINT, *arguments)
     assert code == 1 and "perceptual_loss_module.vgg.features.0.bias' of VGG-19 is missing" in error
     assert os.listdir(tmp_path) == []

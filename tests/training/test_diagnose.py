@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from rounding import bound
 from target_cases import DRIVEN, PIXELS, SIZE, mapped_tube, small, views
-from training_cases import without_upsampler
+from training_cases import batch_of, without_upsampler
 
 from experiments.training import random_weights
 from humangs_jax.core.pytree import inexact_leaves, replace
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Example
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network import reader, transformer, vertex_decoder
@@ -47,11 +47,7 @@ CONFIG = tiny()
 
 @pytest.fixture(scope="module")
 def batch(body, captures):
-    size = CONFIG.model.conventions.image_size
-    source = Loader(
-        CaptureSource(CaptureCache(captures, body), CONFIG.views, size, CONFIG.target_size), CONFIG.batch_size
-    )
-    return source.batch_at(0)
+    return batch_of(body, captures, CONFIG)
 
 
 def with_leaf(tree, path, change):

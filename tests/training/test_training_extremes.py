@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_cases import batch_of
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
@@ -16,14 +16,6 @@ from humangs_jax.training.step import train_step
 CONFIG = tiny()
 OUTSIDE = 100.0
 """Metres that take any subject out of any image."""
-
-
-def batch_of(body, captures, config, step=0):
-    size = config.model.conventions.image_size
-    source = Loader(
-        CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size
-    )
-    return source.batch_at(step)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import capture_from_arrays, save_capture
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import paper_parts
 
@@ -90,3 +91,11 @@ def write_subject(path, body, seed):
         body=body,
     )
     save_capture(path, capture)
+
+
+def batch_of(body, captures, config, step=0):
+    size = config.model.conventions.image_size
+    source = Loader(
+        CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size
+    )
+    return source.batch_at(step)

@@ -8,12 +8,13 @@ import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel, kind_of, pose_landmarks
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.core.pytree import Batchable, pytree_dataclass
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.solve import robust
 from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.transform import EXACT
 
@@ -60,6 +61,15 @@ def make_observations(points, confidences, K, cam_from_world, world=None) -> Obs
         else (points, confidences, K, cam_from_world, noise, world)
     )
     return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
+
+
+def scaled_observations(cameras: Camera, keypoints: Keypoints, scale: float) -> Observations:
+    """Keypoints of images of another scale: a batch of views, each with one view (c = 1)."""
+    points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
+    arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
+    seen = make_observations(*(x[None] for x in arrays))
+    by_view = {name: getattr(seen, name)[0][:, None] for name in ("points", "confidences", "K", "cam_from_world")}
+    return replace(seen, **by_view, noise=jnp.broadcast_to(seen.noise, (len(points),)))
 
 
 def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:

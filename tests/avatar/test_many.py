@@ -7,9 +7,9 @@ import pytest
 from command_line import save_tiny_avatar
 
 from humangs_jax import cli
-from humangs_jax.apps import many
-from humangs_jax.apps.many import reconstruct_many
+from humangs_jax.avatar import reconstruct as many
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.reconstruct import reconstruct_many
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.network import presets
 from humangs_jax.network.humangs import init_humangs
