@@ -1,6 +1,6 @@
 """Front-to-back compositing of splats over tiles, and its hand-written gradient.
 
-A splat is a row of `SPLAT_WIDTH` numbers (see `pack_splats`). With d the offset of a pixel centre from the splat's
+A splat is a row of numbers (see `pack_splats`). With d the offset of a pixel centre from the splat's
 centre,
 
     raw_k   = exp(log opacity - (r00 dx + r01 dy)^2 - (r11 dy)^2)                    r^T r = conic / 2, conic = cov2d^-1
@@ -41,18 +41,16 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length, expand
 
 X, Y, R00, R01, R11, LOG_OPACITY = range(6)
-FEATURES = slice(6, 10)
-FEATURE_COUNT = 4
-"""Red, green, blue and z. A constant: XLA unrolls them."""
-SPLAT_WIDTH = 10
+FEATURES = slice(6, None)
+"""Red, green, blue, z, and any others: their number is static, XLA unrolls them."""
 Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
 EXACT = lax.Precision.HIGHEST
 """GPUs and TPUs would otherwise round the factors of a product to 10 or 8 bits."""
 
 
 def pack_splats(
-    projected: ProjectedGaussians, opacities: Float[Array, " g"], features: Float[Array, "g 4"], alpha_min: float
-) -> Float[Array, "g 10"]:
+    projected: ProjectedGaussians, opacities: Float[Array, " g"], features: Float[Array, "g n"], alpha_min: float
+) -> Float[Array, "g width"]:
     """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not drawn."""
     p = projected
     drawn = p.visible & (opacities >= alpha_min)
@@ -62,8 +60,8 @@ def pack_splats(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def composite(
-    splats: Float[Array, "g 10"], lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> tuple[Float[Array, "t 4 p"], Float[Array, "t p"], Float[Array, " g"]]:
+    splats: Float[Array, "g width"], lists: TileLists, grid: TileGrid, config: SplatConfig
+) -> tuple[Float[Array, "t n p"], Float[Array, "t p"], Float[Array, " g"]]:
     """Draws lists of splats, which must be in depth order, into tiles.
 
     Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; and the largest w of each
@@ -95,7 +93,7 @@ def _scheduled(on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: Sp
     return lax.platform_dependent(*arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config))
 
 
-def _splat_gradients(splats: Float[Array, "g 10"], sums: Float[Array, "g 10"]) -> Float[Array, "g 10"]:
+def _splat_gradients(splats: Float[Array, "g width"], sums: Float[Array, "g width"]) -> Float[Array, "g width"]:
     """Gradient of the rows from their sums over pixels of e (1, dx, dy, dx^2, dx dy, dy^2) and of w g."""
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T
@@ -130,14 +128,14 @@ def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 
 
 def take_chunk(
-    splats: Float[Array, "g 10"],
+    splats: Float[Array, "g width"],
     items: Int[Array, " capacity"],
     starts: Int[Array, " b"],
     counts: Int[Array, " b"],
     tiles: Int[Array, " b"],
     grid: TileGrid,
     k: int,
-) -> tuple[Int[Array, "b k"], Float[Array, "b k 10"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
+) -> tuple[Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
     """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on `tiles`.
 
     Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw alphas (0 past the end).
@@ -215,7 +213,7 @@ last stored link on; storing T after every splat costs more than that."""
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), used parts of the lists (t,), peaks (g,).
+    """(splats, items, starts, counts) -> features (t, n, p), final T (t, p), used parts of the lists (t,), peaks (g,).
 
     peaks: largest w of each splat; 0 unless `config.visibility`.
     """
@@ -254,7 +252,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 return i + 1, transmittance, features, lengths, live, peaks
 
             ones = jnp.ones((block, grid.pixels), dtype)
-            zeros = jnp.zeros((block, FEATURE_COUNT, grid.pixels), dtype)
+            zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
             carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks
             _, transmittance, features, lengths, _, peaks = lax.while_loop(lambda carry: jnp.any(carry[4]), body, carry)
             results = features, jnp.abs(transmittance), lengths
@@ -262,7 +260,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             return *drawn, peaks
 
         out = (
-            jnp.zeros((t, FEATURE_COUNT, grid.pixels), dtype),
+            jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
             jnp.ones((t, grid.pixels), dtype),
             jnp.zeros(t, jnp.int32),
             jnp.zeros(splats.shape[0], dtype),
@@ -274,7 +272,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
 
 @functools.lru_cache
 def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTree]:
-    """(splats, items, starts, lengths, g (t, 4, p), Q (t, p)) -> sums over pixels for each splat, (g, 10).
+    """(splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over pixels for each splat, (g, 6 + n).
 
     They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
     """
@@ -303,7 +301,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
                     alpha = visible_alpha(raw[:, j], config)
                     after = transmittance * (1 - alpha)
                     weight = jnp.where(after > stop, alpha * transmittance, 0.0)
-                    along = sum(row[:, j, 6 + c, None] * g[:, c] for c in range(FEATURE_COUNT))
+                    along = sum(row[:, j, 6 + c, None] * g[:, c] for c in range(splats.shape[1] - FEATURES.start))
                     seen = seen + weight * along
                     slope = (along * transmittance - (total - seen) / (1 - alpha)) * raw[:, j]
                     slopes.append(jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0))
@@ -320,7 +318,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             carry = 0, ones, jnp.zeros_like(ones), sums
             return lax.while_loop(lambda carry: carry[0] < trips, body, carry)[3]
 
-        return lax.fori_loop(0, blocks.used, draw, jnp.zeros((splats.shape[0], SPLAT_WIDTH), dtype))
+        return lax.fori_loop(0, blocks.used, draw, jnp.zeros(splats.shape, dtype))
 
     return backward
 
@@ -396,7 +394,7 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
             before, since = _sums_before(fading, c.tiles, tail)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * jnp.exp(before[:, None] + since), 0.0)
-            features = [jnp.sum(weights * row[..., f, None], axis=1) for f in range(FEATURES.start, FEATURES.stop)]
+            features = [jnp.sum(weights * row[..., f, None], axis=1) for f in range(FEATURES.start, splats.shape[1])]
             parts = jnp.stack([*features, jnp.sum(jnp.where(live, fading, 0.0), axis=1)], axis=1)
             sums = sums.at[c.tiles].add(parts, mode="drop", indices_are_sorted=True)
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
@@ -405,10 +403,10 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyTr
                 peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
             return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
 
-        sums, lengths = jnp.zeros((t, FEATURE_COUNT + 1, p), dtype), jnp.zeros(t, jnp.int32)
+        sums, lengths = jnp.zeros((t, splats.shape[1] - FEATURES.start + 1, p), dtype), jnp.zeros(t, jnp.int32)
         carry = sums, lengths, jnp.zeros(splats.shape[0], dtype), _no_tail(t, p, dtype)
         sums, lengths, peaks, _ = lax.fori_loop(0, chunks.steps, draw, carry)
-        return sums[:, :FEATURE_COUNT], jnp.exp(sums[:, FEATURE_COUNT]), lengths, peaks
+        return sums[:, :-1], jnp.exp(sums[:, -1]), lengths, peaks
 
     return forward
 
@@ -435,7 +433,9 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             transmittance = jnp.exp(before[:, None] + since)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * transmittance, 0.0)
-            along = sum(row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(FEATURE_COUNT))
+            along = sum(
+                row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(splats.shape[1] - FEATURES.start)
+            )
             gained = weights * along
             seen_before, seen_since = _sums_before(gained, c.tiles, seen_tail)
             behind = total[:, None] - (seen_before[:, None] + seen_since + gained)
@@ -450,7 +450,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             )
             return sums.at[item].add(rows, mode="drop"), *tails
 
-        sums, tail = jnp.zeros((splats.shape[0], SPLAT_WIDTH), dtype), _no_tail(t, p, dtype)
+        sums, tail = jnp.zeros(splats.shape, dtype), _no_tail(t, p, dtype)
         return lax.fori_loop(0, chunks.steps, draw, (sums, tail, tail))[0]
 
     return backward

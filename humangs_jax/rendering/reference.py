@@ -22,7 +22,7 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, LARGEST_FOOTPRINT, SplatConfig, splat_config
-from humangs_jax.rendering.splatting import Background, Rendering, with_background
+from humangs_jax.rendering.splatting import Background, Rendering, features_of, with_background
 
 
 @checked_arguments
@@ -31,16 +31,20 @@ def render_reference(
     camera: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
+    features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     """The image of `splatting.render` by its definition, without tiles or buffers, in the precision of its arguments.
 
     Arguments as `splatting.render`; of `config`, only what decides on what is drawn is read. Values are not checked.
     """
-    return _reference(*with_background(gaussians, camera, background), splat_config(config))
+    drawn = with_background(gaussians, camera, background)
+    return _reference(*drawn, splat_config(config), features_of(gaussians, features))
 
 
 @jax.jit
-def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig) -> Rendering:
+def _reference(
+    gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None
+) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
@@ -67,7 +71,6 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
         return state, None
 
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
-    state = jnp.zeros((*blank.shape, 3), blank.dtype), blank, blank + 1, blank > 0
     colors = gaussians.colors
     if gaussians.harmonics is not None:
         sight = jnp.where(visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0)
@@ -75,12 +78,16 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
         sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
         functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
         colors = jnp.maximum(colors + jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics), 0)
+    if features is not None:
+        colors = jnp.concatenate([colors, features], axis=-1)
+    state = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype), blank, blank + 1, blank > 0
     splats = centers, axes, determinants, depths, visible, opacities, colors
     (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
     alpha = 1 - transmittance
     some = alpha > 0
     depth = jnp.where(some, distance / jnp.where(some, alpha, 1.0), 0.0)
-    return Rendering(color + transmittance[..., None] * background, alpha, depth, jnp.int32(0))
+    rgb = color[..., :3] + transmittance[..., None] * background
+    return Rendering(rgb, alpha, depth, jnp.int32(0), features=None if features is None else color[..., 3:])
 
 
 def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple[Array, Array, Array, Array]:

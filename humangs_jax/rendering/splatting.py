@@ -28,7 +28,7 @@ from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.io.images import image_row, named_color, png_bytes
-from humangs_jax.rendering.compositing import FEATURE_COUNT, composite, pack_splats
+from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
@@ -65,7 +65,8 @@ class Rendering(Batchable):
     rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
     colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
     drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
-    differentiable; None unless `SplatConfig.visibility`.
+    differentiable; None unless `SplatConfig.visibility`. features: (h, w, n) sums of the features by the weights of the colors,
+    over 0; None without.
     """
 
     rgb: Float[Array, "h w 3"]
@@ -73,6 +74,7 @@ class Rendering(Batchable):
     depth: Float[Array, "h w"]
     overflow: Int[Array, ""]
     visibility: Float[Array, " g"] | None = None
+    features: Float[Array, "h w n"] | None = None
 
     def _repr_png_(self) -> bytes:
         """The image, or those of a batch side by side, for notebooks."""
@@ -94,6 +96,7 @@ def render(
     camera: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
+    features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     """Draws Gaussians as one camera sees them.
 
@@ -105,6 +108,7 @@ def render(
 
     Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
     the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a color's name; None: white.
+    features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has learned.
 
     Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
     each other, a background that is no color, values that are not finite, opacities outside of [0, 1] and negative scales or
@@ -119,7 +123,7 @@ def render(
             f"render draws one camera, got a batch {camera.batch_shape}: use render_views(gaussians, cameras), "
             "or jax.vmap(render, in_axes=(None, 0))(gaussians, cameras) to draw all views at once"
         )
-    return _render(_draw_image, gaussians, camera, config, background)
+    return _render(_draw_image, gaussians, camera, config, background, features)
 
 
 @checked_arguments
@@ -167,20 +171,27 @@ def _render(
     cameras: Camera,
     config: SplatConfig | str,
     background: Background,
+    features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background))):
+    features = features_of(gaussians, features)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background, features))):
         config = with_default_buffers(gaussians, cameras, config)
-        rendering = draw(gaussians, cameras, background, config)
+        rendering = draw(gaussians, cameras, background, config, features)
         warn_of_overflow(rendering.overflow, config)
         return rendering
-    check_values("render", gaussian_values(gaussians) | camera_values(cameras) | {"background": (background, FINITE)})
+    check_values(
+        "render",
+        gaussian_values(gaussians)
+        | camera_values(cameras)
+        | {"background": (background, FINITE), "features": (features, FINITE)},
+    )
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0)
-    rendering = _jitted(draw)(gaussians, cameras, background, config)
+    rendering = _jitted(draw)(gaussians, cameras, background, config, features)
     raise_on_overflow(rendering.overflow, gaussians, cameras, config)
     return rendering
 
@@ -190,9 +201,11 @@ def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
     return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
 
 
-def _draw_image(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig) -> Rendering:
-    gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
-    return draw(gaussians, camera, background, config)
+def _draw_image(
+    gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None = None
+) -> Rendering:
+    gaussians, features = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), (gaussians, features))
+    return draw(gaussians, camera, background, config, features)
 
 
 @jax.custom_vjp
@@ -231,6 +244,13 @@ def with_background(
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
 
+def features_of(gaussians: Gaussians, features: Float[Array, "g n"] | None) -> Float[Array, "g n"] | None:
+    """In float32 at least. Raises: ValueError for those of other Gaussians."""
+    if features is not None and features.shape[:1] != gaussians.opacities.shape:
+        raise ValueError(f"features: expected shape ({len(gaussians.opacities)}, n), got {features.shape}")
+    return at_least_float32(features)
+
+
 def _color(background: object, dtype: np.dtype) -> Array:
     if background is None:
         return jnp.ones(3, dtype)
@@ -267,26 +287,43 @@ def draw_projected(
     return rendering
 
 
-def draw(gaussians: Gaussians, camera: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Float[Array, "3"],
+    config: SplatConfig,
+    features: Float[Array, "g n"] | None = None,
+) -> Rendering:
     """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
-    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config)
+    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config, features)
 
 
-def draw_views(gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
+def draw_views(
+    gaussians: Gaussians,
+    cameras: Camera,
+    background: Float[Array, "3"],
+    config: SplatConfig,
+    features: Array | None = None,
+) -> Rendering:
     """`draw` for every camera of a batch, one after the other."""
-    return lax.map(lambda camera: draw(gaussians, camera, background, config), cameras)
+    return lax.map(lambda camera: draw(gaussians, camera, background, config, features), cameras)
 
 
 def _draw(
-    projected: ProjectedGaussians, gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig
+    projected: ProjectedGaussians,
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Array,
+    config: SplatConfig,
+    others: Array | None = None,
 ) -> Rendering:
     if config.scale != 1:
         small = dataclasses.replace(config, scale=1.0)
-        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small)
+        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small, others)
         return _resized(drawn, camera)
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     if gaussians.means.shape[0] == 0:
-        blank = jnp.zeros((grid.tiles, FEATURE_COUNT, grid.pixels), projected.x.dtype)
+        blank = jnp.zeros((grid.tiles, 4 + (0 if others is None else others.shape[1]), grid.pixels), projected.x.dtype)
         visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
         return _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
 
@@ -301,7 +338,8 @@ def _draw(
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
-    seen = jnp.concatenate([projected.seen_from_here(gaussians.colors), behind[:, None]], axis=-1)
+    seen = [projected.seen_from_here(gaussians.colors), behind[:, None], *([] if others is None else [others])]
+    seen = jnp.concatenate(seen, axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
     features, transmittance, peaks, overflow = _draw_tiles(footprints, splats, grid, config)
@@ -312,7 +350,7 @@ def _draw(
 def _draw_tiles(
     footprints: Footprints | Squares, splats: Array, grid: TileGrid, config: SplatConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Tiles of premultiplied features (t, 4, p) and the final T (t, 1, p), largest weights (g,), overflow.
+    """Tiles of premultiplied features (t, 4 + n, p) and the final T (t, 1, p), largest weights (g,), overflow.
 
     Footprints and splats in depth order.
     """
@@ -332,24 +370,27 @@ def _blended(
     overflow: Array,
     visibility: Array | None,
 ) -> Rendering:
-    """features: (t, 4, p) premultiplied rgb and z - nearest. transmittance: (t, 1, p) the final one.
+    """features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p) the final one.
 
     Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor does its gradient.
     """
     alpha = 1 - transmittance
     rgb = features[:, :3] + transmittance * background[:, None]
-    depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:], alpha), 0.0)
+    depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:4], alpha), 0.0)
     rgb, alpha, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
-    return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility)
+    others = tiles_to_image(features[:, 4:], grid) if features.shape[1] > 4 else None
+    return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility, others)
 
 
 def _resized(rendering: Rendering, camera: Camera) -> Rendering:
     """The image at the camera's size; depth is weighted by alpha."""
     r = rendering
-    premultiplied = jnp.concatenate([r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]], axis=-1)
+    premultiplied = [r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]]
+    premultiplied = jnp.concatenate([*premultiplied, *([] if r.features is None else [r.features])], axis=-1)
     image = _resampled(_resampled(premultiplied, camera.height, 0), camera.width, 1)
     alpha = image[..., 3]
-    return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility)
+    others = None if r.features is None else image[..., 5:]
+    return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility, others)
 
 
 def _resampled(image: Array, size: int, axis: int) -> Array:

@@ -16,6 +16,7 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, wi
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.rendering.bands import render_in_bands
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splatting import (
@@ -94,6 +95,39 @@ def test_equals_the_reference_with_all_gradients(seed, functions):
         ours, expected = (f(gaussians, camera(), background()) for f in (tiled, reference))
         assert_close(ours, expected, FLOAT64)
         assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(expected[1]))
+
+
+def test_features_are_drawn_beside_the_colors():
+    """With gradients of all, as the reference has them; nothing else changes, however the image is resized."""
+    rng = np.random.default_rng(4)
+    with jax.enable_x64(True):
+        gaussians, view = random_gaussians(13), camera()
+        features, weights = jnp.asarray(rng.normal(size=(COUNT, 5))), jnp.asarray(rng.normal(size=(*VIEW, 5)))
+
+        def loss(gaussians, features, draw, config):
+            rendering = draw(gaussians, view, config, features=features)
+            return jnp.sum(weights * rendering.features), rendering
+
+        found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=(2, 3))
+        ours, expected = (found(gaussians, features, draw, CHUNKS) for draw in (render, render_reference))
+        assert_close(ours, expected, FLOAT64)
+        half = dataclasses.replace(CHUNKS, scale=0.5)
+        plain, small = render(gaussians, view, half), render(gaussians, view, half, features=gaussians.colors)
+        np.testing.assert_array_equal(small.rgb, plain.rgb)
+        over = small.features + (1 - small.alpha[..., None])  # white
+        np.testing.assert_allclose(over, small.rgb, atol=FLOAT64)
+    with pytest.raises(ValueError, match=r"features: expected shape \(32, n\), got \(31, 5\)"):
+        render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
+
+
+@pytest.mark.parametrize("most", [10_000, 60, 1])
+def test_an_image_in_bands_is_the_image(most):
+    gaussians, view = random_gaussians(3, np.float32), camera(np.float32)
+    whole, banded = render(gaussians, view), render_in_bands(gaussians, view, most_pairs=most)
+    for name in ("rgb", "alpha", "depth"):
+        got, expected = getattr(banded, name), np.asarray(getattr(whole, name))
+        assert got.shape == expected.shape
+        np.testing.assert_allclose(got, expected, atol=FLOAT32)
 
 
 def test_gradients_are_derivatives():
