@@ -320,8 +320,9 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
     out: picture to write
     """
     lines: list[dict[str, Any]] = []
+    begins = []
     for path in logs:
-        offset = max((line["step"] for line in lines), default=0)
+        begins.append(offset := max((line["step"] for line in lines), default=0))
         read = [json.loads(line) for line in path.read_text().splitlines()]
         lines += [line | {"step": line["step"] + offset} for line in read]
     trained = [line for line in lines if line.get("loss") is not None and "event" not in line]
@@ -339,4 +340,9 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
         right.plot([line["step"] for line in validated], psnr, "o-", ms=4, color="C1", label="validation people")
         right.set(xlabel="step", ylabel="PSNR, dB")
         right.legend(loc="lower right")
+        for axis in (left, right):
+            for number, begin in enumerate(begins, start=1):
+                axis.axvline(begin, color="black", lw=0.8, ls=":")
+                axis.annotate(f"run {number}", (begin, 1), (3, -10), fontsize=7, xycoords=("data", "axes fraction"),
+                              textcoords="offset points")  # fmt: skip
     run.show(f"{out}: {len(trained)} points, {len(validated)} validations")
