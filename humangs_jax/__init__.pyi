@@ -28,13 +28,13 @@ from .apps.settings import tune as tune
 # avatar -> poses, videos, files
 from .avatar.avatar import Avatar as Avatar
 from .avatar.animate import animate as animate, skin as skin
-from .avatar.shot import Shot as Shot
 from .avatar.video import write_video as write_video
 from .avatar.export.files import export as export
 from .viewer.page import show as show
 
 # Gaussians -> image
 from .rendering.gaussians import Gaussians as Gaussians
+from .avatar.export.gaussians import load_gaussians as load_gaussians, save_gaussians as save_gaussians
 from .geometry.camera import Camera as Camera, look_at as look_at, orbit as orbit
 from .rendering.splatting import render as render, render_views as render_views
 from .rendering.reference import render_reference as render_reference

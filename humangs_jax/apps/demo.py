@@ -16,7 +16,7 @@ import numpy as np
 from humangs_jax.apps.settings import Settings
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.gaussians import write_ply
+from humangs_jax.avatar.export.ply import write_ply
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct

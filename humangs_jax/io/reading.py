@@ -47,7 +47,7 @@ class Limits:
         beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
     members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON and YAML.
     pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
-    corners: of the triangles of a scan, every instance counted. joints: of a body.
+    corners: of the triangles of a scan, every instance counted. joints: of a body. gaussians: of a file.
     photos_outside: whether photos and masks of a capture may lie outside of its folder.
 
     What a command may cost, checked before it begins:
@@ -74,6 +74,7 @@ class Limits:
     scans: int = 64
     corners: int = 60_000_000
     joints: int = 1024
+    gaussians: int = 20_000_000
     photos_outside: bool = False
     capture_pixels: int = 1_000_000_000
     video_pixels: int = 50_000_000_000

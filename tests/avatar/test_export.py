@@ -20,15 +20,11 @@ from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, ExportFormat, chosen_format
 from humangs_jax.avatar.export.files import export, frame_range
-from humangs_jax.avatar.export.gaussians import (
-    SH_C0,
-    grounded_gaussians,
-    turned,
-    write_glb,
-    write_ply,
-    write_splat,
-    write_spz,
-)
+from humangs_jax.avatar.export.gaussians import SH_C0, grounded_gaussians, turned
+from humangs_jax.avatar.export.glb import write_glb
+from humangs_jax.avatar.export.ply import write_ply
+from humangs_jax.avatar.export.splat import write_splat
+from humangs_jax.avatar.export.spz import write_spz
 from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported
@@ -148,20 +144,15 @@ def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thick
     back = read_ply(folder / "a.ply")
     np.testing.assert_allclose(np.asarray(back.means) @ R, before.means, rtol=1e-6)  # R^-1 = R^T
     assert max(off_by(world, back)) < 1e-5
-    back, half_turn = read_spz(folder / "a.spz"), np.asarray([-1, 1, -1])
+    back = read_spz(folder / "a.spz")
     step = max(1e-6, np.abs(before.means).max() * 2.0**-22)
-    np.testing.assert_allclose((back.means * half_turn) @ R, before.means, atol=step)
-    covariance, opacity, color = off_by(world, replace(back, quats=_about_y(back.quats)))
+    np.testing.assert_allclose(np.asarray(back.means) @ R, before.means, atol=step)
+    covariance, opacity, color = off_by(world, back)
     assert opacity <= 0.501 / 255 and color <= 0.501 / 255 / 0.15 * SH_C0
     # scales in steps of 1 / 16: e^(1 / 16) of the squares. Those below e^-10 become it; of a covariance whose largest scale is s
     # the largest element is at least s^2 / 3
     raised = 3 * (np.exp(-10) / np.asarray(scales).max()) ** 2 if np.asarray(scales).min() < np.exp(-10) else 0
     assert covariance < 0.08 + raised
-
-
-def _about_y(quats):
-    w, x, y, z = np.asarray(quats).T
-    return jnp.asarray(np.stack([-y, z, w, -x], axis=1))
 
 
 def test_frames_are_named_as_python_names_them():
@@ -304,6 +295,8 @@ def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monke
         means = np.asarray(read_ply(tmp_path / name).means)
     elif name.endswith(".spz"):
         means = np.asarray(read_spz(tmp_path / name).means)
+        facing_z = np.sort(-np.asarray(person().means)[:, 2])  # backwards
+        np.testing.assert_allclose(np.sort(means[:, 2]), facing_z, atol=1e-5)
     elif name.endswith(".glb"):
         means = read_glb(tmp_path / name)[1]["POSITION"]
     else:
@@ -434,7 +427,8 @@ def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
     """Worlds, scales, rotations, opacities and colors of both files are the same to a program that is not ours."""
     gaussians = person()
     write = {"a.ply": write_ply, "a.spz": write_spz}[name]
-    write(tmp_path / name, turned(gaussians, chosen_format(Path(name).suffix).up))
+    form = chosen_format(Path(name).suffix)
+    write(tmp_path / name, rotated(gaussians, BACKWARDS) if form.backwards else turned(gaussians, form.up))
     write_glb(tmp_path / "a.glb", gaussians)
     transformed(tmp_path / name, tmp_path / "b.glb")
     (ours, arrays), (theirs, others) = (read_glb(tmp_path / name) for name in ("a.glb", "b.glb"))

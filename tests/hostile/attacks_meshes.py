@@ -1,5 +1,6 @@
 """Scans: accessors, instances, textures, and formats that are not read."""
 
+import gzip
 import os
 import re
 import struct
@@ -68,6 +69,29 @@ GLBS = {
 }
 for kind, (change, item) in GLBS.items():
     case(kind, "glb", glb(change), "either" if "nodes" in kind else "refused", item)
+
+
+def gaussians_ply(*lines, size=0):
+    header = "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode()
+    return written("a.ply", header + bytes(size))
+
+
+def spz(count, degree, size=0):
+    header = struct.pack("<IIIBBBB", 0x5053474E, 3, count, degree, 12, 0, 0)
+    return written("a.spz", lambda: gzip.compress(header + bytes(size)))
+
+
+GAUSSIANS = {
+    "10^12 in the header": ("3dgs", gaussians_ply("element vertex 1000000000000", "property float x"), 5),
+    "20 million without a file": ("3dgs", gaussians_ply("element vertex 20000000", "property float x", size=99), 5),
+    "10 million without properties": ("3dgs", gaussians_ply("element vertex 10000000"), 5),
+    "one property twice": ("3dgs", gaussians_ply("element vertex 1", *["property float x"] * 2, size=8), 6),
+    "4 billion": ("spz", spz(2**32 - 1, 0), 5),
+    "19 million of zeros, a bomb": ("spz", spz(19_000_000, 3, 64 << 20), 5),
+    "ten times as long, a bomb": ("spz", spz(10, 0, 64 << 20), 5),
+}
+for kind, (reader, make, item) in GAUSSIANS.items():
+    case(kind, reader, make, item=item)
 case("a chain of 5,000 nodes", "glb", glb(chain_of_nodes), "either", 5)
 case("a texture that is EPS", "glb", glb(images=EPS), item=4)
 case("a texture of 13,000 x 13,000", "glb", glb(images=PHOTOS["13,000 x 13,000"][0]), item=5)

@@ -12,6 +12,7 @@ another machine, one with --page docs/security.md, from docs/results/fuzz.json.
 import argparse
 import copy
 import gc
+import gzip
 import io
 import itertools
 import json
@@ -274,6 +275,10 @@ def mutated_glb(data, draw):
     return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
 
 
+def mutated_spz(data, draw):
+    return gzip.compress(mutated_bytes(gzip.decompress(data), draw))
+
+
 def mutated_safetensors(data, draw):
     length = struct.unpack_from("<Q", data)[0]
     header, rest = json.loads(data[8 : 8 + length]), data[8 + length :]
@@ -294,11 +299,12 @@ KINDS = {
     "coco, coco annotations, mmpose, lhm, joints json, manifest, capture, photos, boundary, import, avatarrex, "
     "scene list, evaluation, preprocessed set, preprocessed scene, skipped subject",
     mutated_pickle: "pickle, smplx pkl, aist, phalp, thuman fit",
-    mutated_text: "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, missing photos, actorshq, thuman mesh, "
-    "thuman scan",
+    mutated_text: "opencv yaml, toml, qualisys, easymocap, colmap, obj, off, log, bvh, 3dgs text, missing photos, actorshq, "
+    "thuman mesh, thuman scan",
     mutated_png: "image",
     mutated_zip: "torch zip, gvhmr",
-    mutated_glb: "glb, glb motion",
+    mutated_glb: "glb, glb motion, glb splats",
+    mutated_spz: "spz",
     mutated_safetensors: "safetensors, weights",
 }
 STRUCTURES = {name: mutated for mutated, names in KINDS.items() for name in names.split(", ")}

@@ -19,6 +19,7 @@ from humangs_jax.fitting.files import KEYS, OPTIONAL
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.network.weights import expected_variables, save_weights
 from humangs_jax.people.subject import GENERATOR_VERSION
+from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.training.config import tiny
 
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]
@@ -337,6 +338,47 @@ def write_easymocap_motion(folder):
     for i in range(3):
         (folder / f"{i:06d}.json").write_text(json.dumps([person]))
     return folder
+
+
+def splats(k=3):
+    """Gaussians with harmonics."""
+    some = lambda *shape: jnp.asarray(np.random.default_rng(4).random((12, *shape)), jnp.float32)
+    return Gaussians(some(3), some(4), some(3), some(), some(3), harmonics=some(k, 3) if k else None)
+
+
+def text_ply():
+    """Of Gaussians, in text."""
+    names = [*"xyz", *(f"{kind}_{i}" for kind in ("f_dc", "scale") for i in range(3)), "opacity"]
+    names += [f"rot_{i}" for i in range(4)]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 4",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    return "\n".join([*header, *[" ".join(["0.5"] * len(names))] * 4, ""])
+
+
+def compressed_ply():
+    """Of PlayCanvas, with harmonics."""
+    bounds = [f"{end}_{name}" for end in ("min", "max") for name in (*"xyz", "scale_x", "scale_y", "scale_z")]
+    words = [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element chunk 1",
+        *(f"property float {name}" for name in bounds),
+    ]
+    header += [
+        "element vertex 4",
+        *words,
+        "element sh 4",
+        *(f"property uchar f_rest_{i}" for i in range(9)),
+        "end_header\n",
+    ]
+    body = np.repeat(np.float32([-1, 1]), 6).tobytes() + np.arange(16, dtype="<u4").tobytes() + bytes(36)
+    return "\n".join(header).encode() + body
 
 
 def write_glb_motion(path):

@@ -131,8 +131,9 @@ PLACES = {
     "a link to itself": lambda file: file.symlink_to(file),
     "of a terabyte": huge,
 }
-NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start"}
-"""Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again."""
+NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start", "splat"}
+"""Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again. Zeros are
+Gaussians of a `.splat`, which has no header."""
 
 for seed in (name for name, each in FORMATS.items() if each.make is not None):
     for kind, change in NONSENSE.items():

@@ -22,6 +22,7 @@ from torch_writer import tensors, write_checkpoint, write_stream
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
 from humangs_jax.apps.start import look
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.export.gaussians import load_gaussians, save_gaussians
 from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
 from humangs_jax.body.library import load_body, load_hands, load_smplx, save_body
 from humangs_jax.core.configuration import config_to_json
@@ -238,6 +239,12 @@ ROWS = {
     "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
     "glb motion": (load_motion, saved("m.glb", honest.write_glb_motion)),
+    "3dgs": (load_gaussians, saved("a.ply", lambda path: save_gaussians(path, honest.splats()))),
+    "3dgs text": (load_gaussians, written("a.ply", honest.text_ply)),
+    "3dgs compressed": (load_gaussians, written("a.ply", honest.compressed_ply)),
+    "splat": (load_gaussians, saved("a.splat", lambda path: save_gaussians(path, honest.splats(0)))),
+    "spz": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, honest.splats(15)))),
+    "glb splats": (load_gaussians, saved("a.glb", lambda path: save_gaussians(path, honest.splats(8)))),
     "obj": (colored_mesh, honest.write_obj),
     "ply": (colored_mesh, honest.mesh("ply")),
     "glb": (colored_mesh, written("scan.glb", honest.textured_glb)),

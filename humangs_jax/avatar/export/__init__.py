@@ -1,10 +1,11 @@
 """An avatar in the files that other people's programs open (docs/export.md), and videos of it: the tables of their formats.
 
-`files.export` writes a file, `gaussians` and `mesh` hold what each format is made of.
+`files.export` writes a file, `gaussians.load_gaussians` reads one; `ply`, `splat`, `spz`, `glb` and `mesh` are the formats.
 """
 
 import dataclasses
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 from humangs_jax.core.registry import FOLDER, Format, Formats
 
@@ -24,14 +25,32 @@ class ExportFormat(Format):
     animated: bool = False
     """One file holds all frames of a motion."""
     rest_fields: bool = False
-    """It may have the 45 zero `f_rest_*` fields that some importers (Unity) require: code(path, gaussians, rest_fields)."""
+    """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path, gaussians, rest_fields)."""
+    backwards: bool = False
+    """Its axes are to the right, up and back: half a turn about y from ours."""
+    reader: str | Callable[[bytes], Any] = ""
+    """Of Gaussians, called with the bytes of a file; raises `io.reading.Refused`."""
+    magic: bytes = b""
+    """How its files begin."""
 
 
 EXPORTS = Formats(
-    ply=ExportFormat("3DGS", f"{HERE}.gaussians:write_ply", (".ply",), up="-y", rest_fields=True),
-    splat=ExportFormat("antimatter15's viewer and others", f"{HERE}.gaussians:write_splat", (".splat",), up="-y"),
-    spz=ExportFormat("Niantic's, compressed", f"{HERE}.gaussians:write_spz", (".spz",)),
-    glb=ExportFormat("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.gaussians:write_glb", (".glb",)),
+    ply=ExportFormat(
+        *("3DGS", f"{HERE}.ply:write_ply", (".ply",)),
+        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.ply:read_ply", "magic": b"ply"},
+    ),
+    splat=ExportFormat(
+        *("antimatter15's viewer and others", f"{HERE}.splat:write_splat", (".splat",)),
+        **{"up": "-y", "reader": f"{HERE}.splat:read_splat"},
+    ),
+    spz=ExportFormat(
+        *("Niantic's, compressed", f"{HERE}.spz:write_spz", (".spz",)),
+        **{"backwards": True, "reader": f"{HERE}.spz:read_spz", "magic": b"\x1f\x8b\x08"},
+    ),
+    glb=ExportFormat(
+        *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.glb:write_glb", (".glb",)),
+        **{"reader": f"{HERE}.glb:read_glb", "magic": b"glTF"},
+    ),
     mesh=ExportFormat(
         *("the body as a textured mesh with skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),
         **{"mesh": True, "animated": True},

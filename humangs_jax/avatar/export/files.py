@@ -7,7 +7,7 @@ from pathlib import Path
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, Up, chosen_format
-from humangs_jax.avatar.export.gaussians import grounded_gaussians, turned
+from humangs_jax.avatar.export.gaussians import BACKWARDS, grounded_gaussians, rotated, turned
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.registry import alternatives
 from humangs_jax.data.motion import Motion, grounded
@@ -73,5 +73,6 @@ def export(
     for i, file in enumerate(files):
         gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
         gaussians = turned(grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up)
+        gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
         form(file, gaussians, **({"rest_fields": True} if rest_fields else {}))
     return files

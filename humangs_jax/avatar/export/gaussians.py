@@ -1,39 +1,30 @@
-"""Gaussians in the files of other programs, and the one conversion of worlds that all of them share.
+"""Gaussians in the files of other programs: what all formats share. `EXPORTS` has a row for each, `ply` to `glb` their code.
 
 Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colors in [0, 1]. glTF's world is
 the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z.
 `.spz` has axes to the right, up and back, half a turn about y from ours. So converters make the same of all of them.
-
-    .ply    3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb - 1/2) / Y00,
-            optionally 45 zero f_rest_*, logit opacity, log scales, quaternion wxyz
-    .splat  https://github.com/antimatter15/splat: 32 bytes a Gaussian, position and scales in float32, RGBA and quaternion wxyz
-            in uint8, the largest and most opaque first
-    .spz    version 3 (https://github.com/nianticlabs/spz#file-format): gzip of a header and six arrays, 20 bytes a Gaussian:
-            positions in 24-bit fixed point, scales exp(k / 16 - 10) metres, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15,
-            quaternions by their three smallest components in 10 bits each. Libraries that write it bring a compiler (gsply)
-            or do not install (PyPI's spz)
-    .glb    glTF 2.0 with KHR_gaussian_splatting
-            (https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting)
+`export` turns avatars so; `load_gaussians` and `save_gaussians` leave the numbers as they are.
 """
 
-import gzip
 import os
-import struct
+from collections.abc import Mapping
 from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.export import Up
-from humangs_jax.core.array_types import Float, UInt, UInt8
-from humangs_jax.core.checks import BOUNDED, check_values, checked_arguments
+from humangs_jax.avatar.export import EXPORTS, Up, chosen_format
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
+from humangs_jax.core.registry import alternatives, imported
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.io.atomic import replace_file, write_bytes
-from humangs_jax.io.mesh import VERTICES, GlbWriter
+from humangs_jax.io.arrays import check_array
+from humangs_jax.io.reading import Refused, read_bytes, reading
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, widened
+from humangs_jax.rendering.harmonics import turned_harmonics
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic Y00 = 1 / (2 sqrt(pi))."""
@@ -43,16 +34,6 @@ BACKWARDS = (0.0, 0.0, 1.0, 0.0)
 """The rotation (quaternion, wxyz) of half a turn about y."""
 _HALF = float(np.sqrt(0.5))
 _TURNS = {"y": (1.0, 0.0, 0.0, 0.0), "-y": (0.0, 0.0, 0.0, 1.0), "z": (_HALF, _HALF, 0.0, 0.0)}
-OPACITY_MARGIN = 1e-6
-"""Keeps the logit finite for opacities of 0 and 1."""
-SMALLEST_SCALE = 1e-9
-"""Metres; keeps the logarithm finite for flat Gaussians."""
-SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3
-MOST_FRACTIONAL_BITS = 20
-"""Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
-COLOR_SCALE, SCALE_STEPS, SCALE_ZERO = 0.15, 16.0, 10.0
-QUATERNION_STEPS = 511
-EXTENSION = "KHR_gaussian_splatting"
 
 
 # Worlds ---------------------------------------------------------------------------------------------------------------
@@ -85,7 +66,10 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
     matrix = jnp.asarray(_matrix(turn), gaussians.means.dtype)
     means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
     quats = quaternion.multiply(jnp.asarray(turn, gaussians.quats.dtype), gaussians.quats)
-    return replace(gaussians, means=means, quats=quats)
+    harmonics = gaussians.harmonics
+    if harmonics is not None:
+        harmonics = turned_harmonics(harmonics, matrix[None])
+    return replace(gaussians, means=means, quats=quats, harmonics=harmonics)
 
 
 def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
@@ -111,31 +95,28 @@ def plain_arrays(
     Float[np.ndarray, "g 3"],
     Float[np.ndarray, " g"],
     Float[np.ndarray, "g 3"],
+    Float[np.ndarray, "g k 3"],
 ]:
-    """Means, unit quaternions (wxyz), scales, opacities and colors in float64, without deformations and without low-pass.
+    """Means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for none) in float64, without deformations
+    and without low-pass.
 
     Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain a low-pass
     (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the size that the Gaussians were fitted to.
 
     Raises: ValueError for numbers that files cannot hold: not finite, or of more than `checks.LARGEST`.
     """
-    bounded = {
-        f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in ("means", "quats", "scales", "colors")
-    }
-    if gaussians.harmonics is not None:
-        raise ValueError("export: gaussians.harmonics: expected none: these files hold one color for each Gaussian")
+    names = ("means", "quats", "scales", "colors", "harmonics")
+    bounded = {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
     check_values("export", gaussian_values(gaussians))
     check_values("export", bounded)
     gaussians = replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
-    means, quats, scales, opacities, colors = (
-        np.asarray(x, np.float64)
-        for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
-    )
-    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
-    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
-    return means, unit, scales, opacities, colors
+    g = gaussians
+    harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
+    arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
+    means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)
+    return means, _unit(quats), scales, opacities, colors, harmonics
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
@@ -149,118 +130,99 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
-# Formats --------------------------------------------------------------------------------------------------------------
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 @checked_arguments
-def write_ply(path: str | os.PathLike, gaussians: Gaussians, rest_fields: bool = False) -> None:
-    """Write a 3DGS `.ply`; the file appears whole or not at all.
+def load_gaussians(path: str | os.PathLike) -> Gaussians:
+    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`.
 
-    rest_fields: add the 45 zero `f_rest_*` fields that some importers (Unity) insist on.
+    The numbers are those of the file: nothing is turned, moved or scaled. So y points down in most `.ply` and `.splat`.
+
+    Args:
+        path: The file. How it begins decides the format; where that does not tell (`.splat`), its suffix.
+
+    Returns:
+        Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1], colors 1/2 + Y00 f_dc, and
+        harmonics (g, 3, 3), (g, 8, 3) or (g, 15, 3) if the file has them.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        FileError: It cannot be read, is larger than the limits allow, or has other numbers than it should: file and property.
+
+    Example:
+        scene = hg.load_gaussians("garden.ply")
+        image = hg.render(scene, camera, hg.SPLAT_PRESETS["inria"])
     """
-    import plyfile
-
-    means, quats, scales, opacities, colors = plain_arrays(gaussians)
-    p = np.clip(opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-    columns = dict(zip("xyz", means.T, strict=True))
-    columns |= {f"n{axis}": np.zeros(len(means)) for axis in "xyz"}
-    columns |= {f"f_dc_{i}": sh_of(colors)[:, i] for i in range(3)}
-    if rest_fields:
-        columns |= {f"f_rest_{i}": np.zeros(len(means)) for i in range(45)}
-    columns["opacity"] = np.log(p) - np.log1p(-p)
-    columns |= {f"scale_{i}": np.log(np.maximum(scales[:, i], SMALLEST_SCALE)) for i in range(3)}
-    columns |= {f"rot_{i}": quats[:, i] for i in range(4)}
-    vertices = np.empty(len(means), dtype=[(name, "<f4") for name in columns])
-    for name, values in columns.items():
-        vertices[name] = values
-    content = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
-    replace_file(path, lambda temporary: content.write(str(temporary)))
+    with reading(path, "file of Gaussians"):
+        data = read_bytes(path, "array_bytes")
+        begun = (each for each in EXPORTS.values() if each.magic and data.startswith(each.magic))
+        form = next(begun, None) or chosen_format(os.path.splitext(path)[1])
+        if form is None or not form.reader:
+            raise Refused(f"not known: expected a file ending in {_suffixes()}")
+        return imported(form.reader)(data)
 
 
-def write_splat(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits, quaternions to 7."""
-    means, quats, scales, opacities, colors = plain_arrays(gaussians)
-    rows = np.empty(len(means), [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
-    rows["position"], rows["scale"] = means, scales
-    rows["rgba"] = np.rint(255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1))
-    rows["rotation"] = np.clip(np.rint(128 * quats + 128), 0, 255)
-    order = np.argsort(-opacities * scales.prod(axis=1), kind="stable")  # viewers draw the first while the rest loads
-    write_bytes(path, rows[order].tobytes())
+@checked_arguments
+def save_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
+    """Write Gaussians into a file for other programs; it appears whole or not at all.
 
+    The numbers stay as they are: nothing is turned or moved, so what is up depends on who reads it; `export` turns avatars as
+    each program expects. Deformations become quaternions and scales. A low-pass is taken out of the scales.
 
-def write_spz(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a `.spz`; the file appears whole or not at all.
+    Args:
+        path: Ends in `.ply` (3DGS), `.splat` (8-bit colors, the largest Gaussians first), `.spz` (8-bit colors, scales in steps
+            of 6 %, harmonics from -1 to 1) or `.glb` (KHR_gaussian_splatting).
+        gaussians: With or without harmonics, which `.splat` does not hold.
 
-    Scales lose up to 3 %, colors and opacities to 8 bits, components of quaternions to 10.
+    Raises:
+        ValueError: Another suffix, numbers that files cannot hold, or harmonics that the format does not.
 
-    Raises: ValueError for Gaussians farther than 8,000 km from the origin.
+    Example:
+        hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply"))
     """
-    means, quats, scales, opacities, colors = plain_arrays(rotated(gaussians, BACKWARDS))
-    farthest = np.abs(means).max(initial=1e-6)
-    bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
-    if bits < 0:
-        raise ValueError(f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}")
-    fixed = np.rint(means * 2.0**bits).astype("<i4")
-    with np.errstate(divide="ignore"):
-        steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
-    parts = (
-        fixed[..., None].view("u1")[..., :3],  # the lower three of four bytes
-        _byte(255 * opacities),
-        _byte(255 * (COLOR_SCALE * sh_of(colors) + 0.5)),
-        _byte(steps),
-        _packed_quaternions(quats),
-    )
-    header = struct.pack("<IIIBBBB", SPZ_MAGIC, SPZ_VERSION, len(means), 0, bits, 0, 0)
-    data = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-    write_bytes(path, gzip.compress(data, 9, mtime=0))
+    form = chosen_format(os.path.splitext(path)[1])
+    if form is None or form.mesh:
+        raise ValueError(f"{path}: expected a name ending in {_suffixes()}")
+    form(path, gaussians)
 
 
-def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
-    return np.clip(np.rint(values), 0, 255).astype("u1")
+def _suffixes() -> str:
+    return alternatives(EXPORTS.where(lambda each: not each.mesh).suffixes)
 
 
-def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
-    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.argmax(np.abs(xyzw), axis=1)
-    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
-    sizes = np.clip(np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS).astype("<u4")
-    packed = largest.astype("<u4")
-    for i in range(4):
-        component = packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
-        packed = np.where(largest == i, packed, component).astype("<u4")
-    return packed
+def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]]) -> Gaussians:
+    """Gaussians of means, quaternions (wxyz), scales, opacities, colors and perhaps harmonics, each named as in its file.
 
-
-def write_glb(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
-
-    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
+    Raises: Refused for numbers that are not finite, or not what they should be.
     """
-    means, quats, scales, opacities, colors = plain_arrays(gaussians)
-    arrays = {
-        "POSITION": ("VEC3", means),
-        "COLOR_0": ("VEC4", np.column_stack([linear_of(colors), np.clip(opacities, 0, 1)])),
-        f"{EXTENSION}:ROTATION": ("VEC4", quats[:, [1, 2, 3, 0]]),
-        f"{EXTENSION}:SCALE": ("VEC3", scales),
-        f"{EXTENSION}:OPACITY": ("SCALAR", np.clip(opacities, 0, 1)),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": ("VEC3", sh_of(colors)),
-    }
-    writer = GlbWriter()
-    attributes = {
-        name: writer.array(kind, values, VERTICES, bounds=name == "POSITION") for name, (kind, values) in arrays.items()
-    }
-    about = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
-    document = {
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: about}}]}],
-    }
-    writer.write(path, document)
+    count = len(next(iter(arrays.values())))
+    fields = ("means", "quats", "scales", "opacities", "colors", "harmonics")
+    shapes = ((3,), (4,), (3,), (), (3,), (None, 3))
+    ranges = {"scales": (0.0, LARGEST), "opacities": (0.0, 1.0)}
+    for field, shape, (name, array) in zip(fields, shapes, arrays.items(), strict=False):
+        check_array(name, array, (count, *shape), *ranges.get(field, (-LARGEST, LARGEST)))
+    values = dict(zip(fields, arrays.values(), strict=False))
+    values["quats"] = _unit(values["quats"])
+    return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()})
+
+
+def sigmoid(logits: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits))
+
+
+def exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
+    """Infinite, which is refused, where it is too large."""
+    with np.errstate(over="ignore"):
+        return np.exp(logs)
+
+
+def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
+    """Inverse of `sh_of`."""
+    return 0.5 + SH_C0 * coefficients
+
+
+def _unit(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])

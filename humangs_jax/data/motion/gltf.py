@@ -174,6 +174,13 @@ def _world(
     return world
 
 
+def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
+    """Where the nodes of a GLB file lie when nothing moves. Raises: Refused; what damaged numbers raise."""
+    parents = _parents(nodes)
+    world = _world(nodes, parents, _with_ancestors(range(len(nodes)), parents), {}, np.zeros(1))
+    return [world[i][0] for i in range(len(nodes))]
+
+
 def _local(
     node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m 4 4"]:

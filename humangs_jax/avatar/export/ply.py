@@ -1,0 +1,203 @@
+"""`.ply` of Gaussians: that of 3DGS, and the compressed one of PlayCanvas, which is read only.
+
+3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb - 1/2) / Y00, f_rest_* of
+degrees 1 to 3 (all of red, then of green, then of blue), logit opacity, log scales, quaternion wxyz.
+
+Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk with the bounds of positions, log
+scales and perhaps colors; for each Gaussian four words: position and scale between them in 11, 10 and 11 bits, the quaternion
+without its largest component in 2 bits and three times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
+"""
+
+import io
+import itertools
+import os
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from humangs_jax.avatar.export.gaussians import colors_of, exponential, loaded, plain_arrays, sh_of, sigmoid
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.reading import Refused, check_limit, shown
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.harmonics import COUNTS
+
+OPACITY_MARGIN = 1e-6
+"""Keeps the logit finite for opacities of 0 and 1."""
+SMALLEST_SCALE = 1e-9
+"""Metres; keeps the logarithm finite for flat Gaussians."""
+LONGEST_HEADER = 1 << 16
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+}
+TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
+CHUNK = 256
+REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
+"""Of the bytes of compressed harmonics: the middle of each step, the ends of the first and last."""
+Columns = Mapping[str, np.ndarray]
+
+
+@checked_arguments
+def write_ply(path: str | os.PathLike, gaussians: Gaussians, rest_fields: bool = False) -> None:
+    """Write a 3DGS `.ply`; the file appears whole or not at all.
+
+    rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there are no such harmonics.
+    """
+    import plyfile
+
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    p = np.clip(opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    columns = dict(zip("xyz", means.T, strict=True))
+    columns |= {f"n{axis}": np.zeros(len(means)) for axis in "xyz"}
+    columns |= {f"f_dc_{i}": sh_of(colors)[:, i] for i in range(3)}
+    if rest_fields:
+        harmonics = np.pad(harmonics, ((0, 0), (0, COUNTS[-1] - harmonics.shape[1]), (0, 0)))
+    rest = harmonics.swapaxes(1, 2).reshape(len(means), 3 * harmonics.shape[1])
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(rest.T)}
+    columns["opacity"] = np.log(p) - np.log1p(-p)
+    columns |= {f"scale_{i}": np.log(np.maximum(scales[:, i], SMALLEST_SCALE)) for i in range(3)}
+    columns |= {f"rot_{i}": quats[:, i] for i in range(4)}
+    vertices = np.empty(len(means), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values
+    content = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
+    replace_file(path, lambda temporary: content.write(str(temporary)))
+
+
+def read_ply(data: bytes) -> Gaussians:
+    """Gaussians of the bytes of a file. Raises: Refused; what damaged numbers raise."""
+    elements = _elements(data)
+    vertex = elements.get("vertex", {})
+    if "chunk" in elements:
+        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}))
+    arrays = {
+        "x, y, z": _columns(vertex, *"xyz"),
+        "rot_*": _columns(vertex, *(f"rot_{i}" for i in range(4))),
+        "scale_*": exponential(_columns(vertex, *(f"scale_{i}" for i in range(3)))),
+        "opacity": sigmoid(_columns(vertex, "opacity")[:, 0]),
+        "f_dc_*": colors_of(_columns(vertex, *(f"f_dc_{i}" for i in range(3)))),
+    }
+    return loaded(arrays | _harmonics(vertex))
+
+
+def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, Float[np.ndarray, "g k 3"]]:
+    """Under their name, nothing if there are none. values: what the bytes of a column stand for."""
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count % 3 or count // 3 not in COUNTS:
+        raise Refused(f"f_rest_*: expected 9, 24 or 45 properties, got {count}")
+    if not count:
+        return {}
+    rest = _columns(columns, *(f"f_rest_{i}" for i in range(count)), dtype=np.float32 if values is None else np.uint8)
+    rest = rest if values is None else values[rest]
+    return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
+
+
+def _unpacked(chunk: Columns, vertex: Columns, sh: Columns) -> Gaussians:
+    """Gaussians of compressed columns."""
+    words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
+    bits = {name: np.stack([_bits(words[name], *place) for place in places], axis=1) for name, places in WORDS.items()}
+    count, chunks = len(words["color"]), len(next(iter(chunk.values())))
+    if chunks != -(-count // CHUNK):
+        raise Refused(f"chunk: expected one for each {CHUNK} of {count:,} Gaussians, got {chunks:,}")
+
+    def between(part: Float[np.ndarray, "g 3"], *names: str) -> Float[np.ndarray, "g 3"]:
+        low, high = (_columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max"))
+        return np.repeat(low, CHUNK, axis=0)[:count] * (1 - part) + np.repeat(high, CHUNK, axis=0)[:count] * part
+
+    three = (bits["rotation"] - 0.5) * np.sqrt(2)
+    largest, rest = words["rotation"] >> 30, np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
+    quats = np.empty((count, 4))
+    for i in range(4):
+        quats[largest == i] = np.insert(three, i, rest, axis=1)[largest == i]
+    colors = bits["color"][:, :3]
+    arrays = {
+        "packed_position": between(bits["position"], *"xyz"),
+        "packed_rotation": quats,
+        "packed_scale": exponential(between(bits["scale"], "scale_x", "scale_y", "scale_z")),
+        "opacity": bits["color"][:, 3],
+        "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
+    }
+    return loaded(arrays | _harmonics(sh, REST))
+
+
+_ELEVEN = [(21, 11), (11, 10), (0, 11)]
+WORDS = {
+    "position": _ELEVEN,
+    "rotation": [(20, 10), (10, 10), (0, 10)],
+    "scale": _ELEVEN,
+    "color": [(24, 8), (16, 8), (8, 8), (0, 8)],
+}
+"""Of compressed Gaussians: the lowest bit and the width of each part."""
+
+
+def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]:
+    """From 0 to 1."""
+    return (words >> np.uint32(lowest) & np.uint32(2**width - 1)) / (2**width - 1)
+
+
+def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64) -> np.ndarray:
+    """Properties (g, names) as numbers of a type. Raises: Refused for one that is missing, or not of the bytes it is made of."""
+    for name in names:
+        if name not in columns:
+            raise Refused(f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or packed_*)")
+        if issubclass(dtype, np.integer) and columns[name].dtype.newbyteorder("=") != dtype:
+            raise Refused(f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}")
+    with np.errstate(over="ignore"):
+        return np.stack([columns[name].astype(dtype) for name in names], axis=-1)
+
+
+def _elements(data: bytes) -> dict[str, Columns]:
+    """Columns of the elements, up to one with lists. Nothing is made before it is known that the file is long enough."""
+    end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
+    if end is None:
+        raise Refused("no PLY file: expected a header that ends in end_header")
+    order, counts, types = None, {}, {}
+    for line in data[: end.start()].decode("ascii", "replace").splitlines():
+        match line.split():
+            case [] | ["ply"] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", str(form), _] if form in ORDERS:
+                order = ORDERS[form]
+            case ["element", str(name), str(count)] if name not in counts and count.isdecimal() and len(count) < 20:
+                counts[name], types[name] = int(count), []
+            case ["property", "list", _, _, str(name)] if types:
+                list(types.values())[-1].append((name, None))
+            case ["property", str(kind), str(name)] if types and kind in TYPES and order is not None:
+                list(types.values())[-1].append((name, order + TYPES[kind]))
+            case _:
+                raise Refused(f"header: {shown(line)}: not understood")
+    if order is None:
+        raise Refused("header: no format")
+    lines = None
+    if not order:
+        check_limit("text_bytes", len(data), "bytes")
+        lines = io.StringIO(data[end.end() :].decode("ascii"))
+    found, at = {}, end.end()
+    for name, count in counts.items():
+        if any(kind is None for _, kind in types[name]):
+            break
+        check_limit("gaussians", count, f"elements {name}")
+        dtype = np.dtype(types[name])
+        least = dtype.itemsize if lines is None else 2 * len(types[name])  # a digit and a space
+        if not dtype.names or count * least > len(data) - at + (lines is not None):
+            raise Refused(f"element {name}: {count:,} of them are not in {len(data) - at:,} bytes")
+        if lines is None:
+            rows = np.ndarray((count,), dtype, data, at)
+            found[name] = {each: rows[each] for each in dtype.names}
+            at += count * least
+        elif count:
+            rows = np.loadtxt(itertools.islice(lines, count), comments=None, ndmin=2)
+            if rows.shape != (count, len(dtype.names)):
+                raise Refused(f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got {rows.shape}")
+            found[name] = dict(zip(dtype.names, rows.T, strict=True))
+    return found

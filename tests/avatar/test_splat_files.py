@@ -1,0 +1,372 @@
+"""Gaussians of other people's files: those that we write come back, and files by hand from the published layouts are read."""
+
+import gzip
+import json
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import humangs_jax as hg
+from humangs_jax.core.pytree import replace
+from humangs_jax.io.reading import FileError, Limits, set_limits
+from humangs_jax.rendering.gaussians import Gaussians, covariances
+
+COUNTS = (0, 3, 8, 15)
+C0 = 0.5 / np.sqrt(np.pi)
+EXTENSION = "KHR_gaussian_splatting"
+STEPS = {
+    # means, covariances (relative), opacities, colors, harmonics: what the format's own numbers leave
+    ".ply": (1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
+    ".glb": (1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
+    ".splat": (1e-6, 0.05, 0.51 / 255, 0.51 / 255, 0),
+    ".spz": (1e-6, 0.08, 0.51 / 255, 0.51 / 255 / 0.15 * C0, 0.51 / 128),
+}
+
+
+def scene(count=0, g=20, seed=0) -> Gaussians:
+    """In the order in which `.splat` has them: the largest first."""
+    rng = np.random.default_rng(seed)
+    scales, opacities = np.exp(rng.normal(size=(g, 3)) - 3), rng.uniform(0.05, 0.95, g)
+    order = np.argsort(-opacities * scales.prod(axis=1))
+    arrays = (rng.normal(size=(g, 3)), rng.normal(size=(g, 4)), scales[order], opacities[order], rng.random((g, 3)))
+    harmonics = jnp.asarray(rng.uniform(-0.9, 0.9, (g, count, 3)), jnp.float32) if count else None
+    return Gaussians(*(jnp.asarray(array, jnp.float32) for array in arrays), harmonics=harmonics)
+
+
+def assert_close(found, expected, steps):
+    exact = np.asarray(covariances(expected))
+    np.testing.assert_allclose(found.means, expected.means, atol=steps[0])
+    assert np.abs(np.asarray(covariances(found)) - exact).max() <= steps[1] * np.abs(exact).max()
+    np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(found.opacities, expected.opacities, atol=steps[2])
+    np.testing.assert_allclose(found.colors, expected.colors, atol=steps[3])
+    assert (found.harmonics is None) == (expected.harmonics is None)
+    if found.harmonics is not None:
+        np.testing.assert_allclose(found.harmonics, expected.harmonics, atol=steps[4])
+
+
+CASES = [(suffix, count) for suffix in STEPS for count in COUNTS if suffix != ".splat" or not count]
+
+
+@pytest.mark.parametrize(("suffix", "count"), CASES)
+def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
+    """A second time nothing changes: the steps of the format are taken once."""
+    path, again = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
+    hg.save_gaussians(path, before := scene(count))
+    hg.save_gaussians(again, back := hg.load_gaussians(path))
+    assert_close(back, before, STEPS[suffix])
+    assert_close(hg.load_gaussians(again), back, (2e-6, 0.01, 1e-6, 1e-6, 1e-6))
+    assert_close(
+        hg.load_gaussians(str(path.rename(tmp_path / ("c.splat" if suffix == ".splat" else "c.bin")))), back, [0] * 5
+    )
+
+
+def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
+    rng = np.random.default_rng(3)
+    bent = replace(scene(), deformations=jnp.asarray(np.eye(3) + 0.2 * rng.normal(size=(20, 3, 3)), jnp.float32))
+    hg.save_gaussians(tmp_path / "a.ply", bent)
+    assert_close(hg.load_gaussians(tmp_path / "a.ply"), bent, STEPS[".ply"])
+
+
+def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=False):
+    """3DGS, as its authors' program lays it out."""
+    g = gaussians
+    rest = (
+        np.zeros((len(g.means), 0)) if g.harmonics is None else np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
+    )
+    columns = dict(zip("xyz", np.asarray(g.means).T, strict=True)) | {name: np.arange(20) for name in extra}
+    columns |= {f"f_dc_{i}": (np.asarray(g.colors)[:, i] - 0.5) / C0 for i in range(3)}
+    columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
+    p = np.asarray(g.opacities, np.float64)
+    columns |= {"opacity": np.log(p / (1 - p))} | {f"scale_{i}": np.log(g.scales)[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": 2 * np.asarray(g.quats)[:, i] for i in range(4)}
+    word = {"4": "float", "8": "double"}[kind[-1]]
+    header = ["ply", f"format {form} 1.0", "comment made by hand", "element vertex 20"]
+    header += [f"property {word} {name}" for name in columns]
+    header += ["element face 1", "property list uchar int vertex_indices"] if faces else []
+    rows = np.stack(list(columns.values()), axis=1)
+    text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist()) + "\n"
+    body = text.encode() if form == "ascii" else rows.astype(kind).tobytes()
+    return "\n".join([*header, "end_header\n"]).encode() + body + (b"\3" + bytes(12)) * faces
+
+
+def packed(parts, widths):
+    """Parts from 0 to 1 in words, the first in the highest bits."""
+    word = np.zeros(len(parts), np.uint32)
+    for part, width in zip(parts.T, widths, strict=True):
+        word = word << np.uint32(width) | np.rint(part * (2**width - 1)).astype(np.uint32)
+    return word
+
+
+def smallest_three(quats):
+    """Index of the largest component, which is not negative, and the others in their order."""
+    quats = np.asarray(quats) / np.linalg.norm(quats, axis=1, keepdims=True)
+    largest = np.argmax(np.abs(quats), axis=1)
+    quats = quats * np.sign(quats[np.arange(len(quats)), largest])[:, None]
+    return largest.astype(np.uint32), np.stack([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+
+
+def compressed_ply(gaussians, colors_bounded=True):
+    """Of PlayCanvas: bounds of each 256, and words between them."""
+    g = gaussians
+    largest, three = smallest_three(g.quats)
+    rotation = largest << np.uint32(30) | packed(three / np.sqrt(2) + 0.5, (10, 10, 10))
+    kinds = {"": np.asarray(g.means), "scale_": np.log(g.scales), "c": np.asarray(g.colors)}
+    words, bounds, count = {}, {}, len(g.means)
+    chunks = [slice(at, at + 256) for at in range(0, count, 256)]
+    for key, values in kinds.items():
+        names = "rgb" if key == "c" else [f"{key}{axis}" for axis in "xyz"]
+        low, high = (np.stack([pick(values[chunk], axis=0) for chunk in chunks]) for pick in (np.min, np.max))
+        if key == "c" and not colors_bounded:
+            low, high = np.zeros_like(low), np.ones_like(high)
+        else:
+            bounds |= {f"min_{n}": c for n, c in zip(names, low.T, strict=True)}
+            bounds |= {f"max_{n}": c for n, c in zip(names, high.T, strict=True)}
+        low, high = (np.repeat(each, 256, axis=0)[:count] for each in (low, high))
+        words[key] = (values - low) / (high - low)
+    color = packed(np.column_stack([words["c"], g.opacities]), (8, 8, 8, 8))
+    vertex = [packed(words[""], (11, 10, 11)), rotation, packed(words["scale_"], (11, 10, 11)), color]
+    names = [f"packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    header = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
+    header += [f"property float {name}" for name in bounds] + [f"element vertex {count}"]
+    header += [f"property uint {name}" for name in names]
+    body = (
+        np.stack(list(bounds.values()), axis=1).astype("<f4").tobytes()
+        + np.stack(vertex, axis=1).astype("<u4").tobytes()
+    )
+    if g.harmonics is not None:
+        rest = np.asarray(g.harmonics).swapaxes(1, 2).reshape(count, -1)
+        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
+        body += np.clip(np.trunc((rest / 8 + 0.5) * 256), 0, 255).astype("u1").tobytes()
+    return "\n".join([*header, "end_header\n"]).encode() + body
+
+
+def spz(gaussians, version):
+    """Of Niantic, by its specification."""
+    g, bits = gaussians, 12
+    k = 0 if g.harmonics is None else g.harmonics.shape[1]
+    quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
+    if version == 2:
+        rotations = np.rint(127.5 * np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 127.5).astype("u1").tobytes()
+    else:
+        largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
+        words = largest
+        for part in three.T:
+            words = words << np.uint32(10) | (part < 0).astype(np.uint32) << np.uint32(9)
+            words = words | np.rint(511 * np.sqrt(2) * np.abs(part)).astype(np.uint32)
+        rotations = words.astype("<u4").tobytes()
+    byte = lambda x: np.clip(np.rint(x), 0, 255).astype("u1").tobytes()
+    fixed = np.rint(np.asarray(g.means) * 2**bits).astype(int).reshape(-1).tolist()
+    body = b"".join((n % 2**24).to_bytes(3, "little") for n in fixed) + byte(255 * np.asarray(g.opacities))
+    body += (
+        byte(255 * (0.15 * (np.asarray(g.colors) - 0.5) / C0 + 0.5)) + byte(16 * (np.log(g.scales) + 10)) + rotations
+    )
+    body += byte(128 * np.asarray(g.harmonics) + 128) if k else b""
+    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 20, COUNTS.index(k), bits, 1, 0) + body)
+
+
+def glb(gaussians, node=None, change=lambda content: None, short=False):
+    """glTF 2.0 with the attributes of the extension; rotations in 16 bits where `short` says so."""
+    g = gaussians
+    quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
+    columns = {"POSITION": g.means, f"{EXTENSION}:SCALE": g.scales, f"{EXTENSION}:OPACITY": g.opacities}
+    columns[f"{EXTENSION}:ROTATION"] = quats[:, [1, 2, 3, 0]]
+    columns[f"{EXTENSION}:SH_DEGREE_0_COEF_0"] = (np.asarray(g.colors) - 0.5) / C0
+    names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
+    if g.harmonics is not None:
+        columns |= {name: g.harmonics[:, i] for i, name in enumerate(names[: g.harmonics.shape[1]])}
+    binary, views, accessors = b"", [], []
+    for name, values in columns.items():
+        small = short and name.endswith("ROTATION")
+        data = (np.rint(np.asarray(values) * 32767).astype("<i2") if small else np.asarray(values, "<f4")).tobytes()
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
+        binary += data
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[np.asarray(values).reshape(20, -1).shape[1]]
+        accessors.append(
+            {"bufferView": len(accessors), "componentType": 5122 if small else 5126, "count": 20, "type": kind}
+        )
+        accessors[-1] |= {"normalized": True} if small else {}
+    about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    part = {"attributes": {name: i for i, name in enumerate(columns)}, "mode": 0, "extensions": {EXTENSION: about}}
+    content = {"asset": {"version": "2.0"}, "extensionsUsed": [EXTENSION], "nodes": [{"mesh": 0} | (node or {})]}
+    content |= {"meshes": [{"primitives": [part]}], "accessors": accessors, "bufferViews": views}
+    content |= {"buffers": [{"byteLength": len(binary)}]}
+    change(content)
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+SHORT = (1e-6, 1e-3, 1e-6, 1e-6, 1e-6)
+PACKED = (2e-3, 0.03, 0.51 / 255, 0.51 / 255, 8 / 512)
+"""Positions over some 5 m in 10 bits, harmonics from -4 to 4 in 8."""
+BY_HAND = {
+    "float": (ply, STEPS[".ply"]),
+    "double": (lambda g: ply(g, "<f8"), STEPS[".ply"]),
+    "big-endian, with other properties and faces": (
+        lambda g: ply(g, ">f4", "binary_big_endian", ("nx", "filter_3D"), faces=True),
+        STEPS[".ply"],
+    ),
+    "text": (lambda g: ply(g, form="ascii", extra=("nx",)), STEPS[".ply"]),
+    "compressed": (compressed_ply, PACKED),
+    "compressed, colors from 0 to 1": (lambda g: compressed_ply(g, colors_bounded=False), PACKED),
+    "spz 2": (lambda g: spz(g, 2), (2.0**-13, 0.09, *STEPS[".spz"][2:])),
+    "spz 3": (lambda g: spz(g, 3), (2.0**-13, *STEPS[".spz"][1:])),
+    "glb": (glb, STEPS[".glb"]),
+    "glb in 16 bits": (lambda g: glb(g, short=True), SHORT),
+}
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", BY_HAND)
+def test_files_by_the_published_layouts_are_read(name, count, tmp_path):
+    make, steps = BY_HAND[name]
+    (tmp_path / "a.bin").write_bytes(make(scene(count)))
+    assert_close(hg.load_gaussians(tmp_path / "a.bin"), scene(count), steps)
+
+
+def test_chunks_of_compressed_files_have_bounds_of_their_own(tmp_path):
+    many = scene(g=300)
+    many = replace(many, means=many.means + 100 * (jnp.arange(300) >= 256)[:, None])
+    (tmp_path / "a.compressed.ply").write_bytes(compressed_ply(many))
+    assert_close(hg.load_gaussians(tmp_path / "a.compressed.ply"), many, (4e-3, *PACKED[1:]))
+
+
+def test_splat_is_read_by_its_suffix(tmp_path):
+    g = scene()
+    quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
+    numbers = np.column_stack([g.means, g.scales]).astype("<f4")
+    bytes_ = np.clip(np.rint(np.column_stack([255 * g.colors, 255 * g.opacities, 128 * quats + 128])), 0, 255).astype(
+        "u1"
+    )
+    rows = b"".join(a.tobytes() + b.tobytes() for a, b in zip(numbers, bytes_, strict=True))
+    (tmp_path / "a.SPLAT").write_bytes(rows)
+    assert_close(hg.load_gaussians(tmp_path / "a.SPLAT"), g, STEPS[".splat"])
+
+
+def test_gaussians_of_a_glb_lie_where_its_nodes_are(tmp_path):
+    """Half a turn about z, twice as large, one higher; beside it another one that stays."""
+    node = {"rotation": [0, 0, 1, 0], "scale": [2, 2, 2], "translation": [0, 1, 0]}
+    (tmp_path / "a.glb").write_bytes(glb(scene(3), node, lambda content: content["nodes"].append({"mesh": 0})))
+    g, before = hg.load_gaussians(tmp_path / "a.glb"), scene(3)
+    placed = np.asarray(before.means) * [-2, -2, 2] + [0, 1, 0]
+    np.testing.assert_allclose(g.means, np.concatenate([placed, before.means]), atol=1e-5)
+    np.testing.assert_allclose(np.sort(g.scales[:20]), np.sort(2 * before.scales), rtol=1e-4)
+    turned = np.asarray(before.harmonics) * np.asarray([-1, 1, -1])[:, None]  # of y, z and x
+    np.testing.assert_allclose(g.harmonics, np.concatenate([turned, before.harmonics]), atol=1e-5)
+
+
+def with_nan(field, place=(3,)):
+    return replace(scene(3), **{field: getattr(scene(3), field).at[place].set(np.nan)})
+
+
+def accessor(**changes):
+    return lambda content: content["accessors"][1].update(changes)
+
+
+def without(name):
+    return lambda content: content["meshes"][0]["primitives"][0]["attributes"].pop(f"{EXTENSION}:{name}")
+
+
+def headed(*lines, body=b""):
+    return "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode() + body
+
+
+def spz_of(version=3, count=20, degree=0, body=b"", behind=b""):
+    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, 12, 0, 0) + body) + behind
+
+
+BAD = {
+    "ply of NaN": (lambda: ply(with_nan("scales")), r"scale_\*: expected numbers in \[0"),
+    "ply of NaN in text": (lambda: ply(with_nan("opacities"), form="ascii"), "opacity: expected numbers in"),
+    "ply of NaN harmonics": (lambda: ply(with_nan("harmonics")), r"f_rest_\*: expected"),
+    "ply cut off": (lambda: ply(scene())[:-1], "element vertex: 20 of them are not in"),
+    "ply of text cut off": (lambda: ply(scene(), form="ascii")[:-900], "the number of columns changed"),
+    "ply of few lines": (lambda: ply(scene(), form="ascii").rsplit(b"\n", 2)[0], "expected 20 lines of 14 numbers"),
+    "ply of points": (lambda: ply(scene()).replace(b"f_dc_0", b"red"), "f_dc_0: missing: expected Gaussians"),
+    "ply of 8 harmonics": (lambda: ply(scene(3)).replace(b"f_rest_8", b"rest_8"), "expected 9, 24 or 45 properties, got 8"),
+    "ply of 10^15": (lambda: headed("element vertex 1000000000000000", "property float x"), "the limit gaussians is"),
+    "ply of -1": (lambda: headed("element vertex -1", "property float x"), "header: 'element vertex -1'"),
+    "ply of nothing each": (lambda: headed("element vertex 9"), "element vertex: 9 of them"),
+    "ply of a list": (lambda: headed("element vertex 1", "property list int float x", body=bytes(99)), "x: missing"),
+    "compressed without chunks": (
+        lambda: compressed_ply(scene()).replace(b"chunk 1", b"chunk 0"), "chunk: expected one for each 256",
+    ),
+    "compressed in floats": (lambda: compressed_ply(scene()).replace(b"uint packed_s", b"float packed_s"), "expected uint32"),
+    "compressed of fewer harmonics": (
+        lambda: compressed_ply(scene(3)).replace(b"element sh 20", b"element sh 19"), r"f_rest_\*: expected shape \(20,",
+    ),
+    "splat of 33 bytes": (lambda: bytes(33), "expected 32 bytes for each Gaussian"),
+    "splat of NaN": (lambda: np.full(8, np.nan, "<f4").tobytes(), "position: expected"),
+    "splat of a negative scale": (lambda: np.full(8, -1, "<f4").tobytes(), "scale: expected numbers in"),
+    "spz of 2^32": (lambda: spz_of(count=2**32 - 1), "4,294,967,295 Gaussians: the limit gaussians"),
+    "spz bomb": (lambda: spz_of(count=19_000_000, degree=3), "bytes unpack to"),
+    "spz cut off": (lambda: spz(scene(), 3)[:-30], "not a readable file of Gaussians"),
+    "spz too short": (lambda: spz_of(body=bytes(399)), "20 Gaussians in 400 bytes, got less"),
+    "spz too long": (lambda: spz_of(body=bytes(401)), "20 Gaussians in 400 bytes, got more"),
+    "spz with more behind": (lambda: spz_of(body=bytes(400), behind=b"more"), "not a readable file of Gaussians"),
+    "spz 4": (lambda: spz_of(version=4), "version 2 or 3 and degree 0 to 3, got version 4"),
+    "spz of degree 9": (lambda: spz_of(degree=9), "got version 3 and degree 9"),
+    "another gzip": (lambda: gzip.compress(b"hello"), "version 2 or 3"),
+    "glb of NaN": (lambda: glb(with_nan("opacities")), "OPACITY: expected numbers in"),
+    "glb of logarithms": (lambda: glb(replace(scene(), scales=-scene().scales)), "SCALE: expected numbers in"),
+    "glb without rotations": (lambda: glb(scene(), change=without("ROTATION")), "ROTATION: missing"),
+    "glb without a harmonic": (lambda: glb(scene(3), change=without("SH_DEGREE_1_COEF_1")), "SH_DEGREE_1_COEF_1: missing"),
+    "glb of few scales": (lambda: glb(scene(), change=accessor(count=19)), r"SCALE: expected shape \(20, 3\)"),
+    "glb of many scales": (lambda: glb(scene(), change=accessor(count=10**15)), "bytes unpacked"),
+    "glb of a mesh": (lambda: glb(scene(), change=lambda c: c["meshes"][0]["primitives"][0].pop("extensions")), "no Gaussians"),
+    "glb of compressed Gaussians": (
+        lambda: glb(scene(), change=lambda c: c.update(extensionsRequired=["SPZ_2"])), "needs the extension 'SPZ_2'",
+    ),
+    "glb of many copies": (lambda: glb(scene(), change=lambda c: c["nodes"].extend([{"mesh": 0}] * 2001)), "limit parts"),
+    "glb of a node in itself": (lambda: glb(scene(), {"children": [0]}), "lies below itself"),
+    "text": (lambda: b"hello", "expected a file ending in .ply, .splat, .spz or .glb"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_damaged_files_are_one_line_with_file_and_property(name, tmp_path):
+    make, message = BAD[name]
+    path = tmp_path / ("a.splat" if name.startswith("splat") else "a.bin")
+    path.write_bytes(make())
+    with pytest.raises(FileError, match=message) as error:
+        hg.load_gaussians(path)
+    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+
+
+def test_as_many_as_the_limits_allow(tmp_path):
+    for suffix in STEPS:
+        hg.save_gaussians(tmp_path / f"a{suffix}", scene())
+    try:
+        set_limits(Limits(gaussians=19))
+        for suffix in STEPS:
+            with pytest.raises(FileError, match=r"20 .*: the limit gaussians is 19"):
+                hg.load_gaussians(tmp_path / f"a{suffix}")
+    finally:
+        set_limits(None)
+    with pytest.raises(FileNotFoundError):
+        hg.load_gaussians(tmp_path / "none.ply")
+
+
+def test_what_a_file_cannot_hold_is_not_written(tmp_path):
+    for name, gaussians, message in (
+        ("a.splat", scene(3), r"a\.splat holds one color|one color for each Gaussian"),
+        ("a.obj", scene(), r"expected a name ending in \.ply, \.splat, \.spz or \.glb"),
+        ("a.ply", with_nan("harmonics"), "harmonics: expected finite numbers"),
+        ("a.glb", scene(g=0), "at least one Gaussian"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            hg.save_gaussians(tmp_path / name, gaussians)
+    assert not list(tmp_path.iterdir())
+
+
+def test_colors_of_other_spaces_are_told(tmp_path, caplog):
+    linear = lambda content: content["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(
+        colorSpace="lin_rec709_display"
+    )
+    (tmp_path / "a.glb").write_bytes(glb(scene(), change=linear))
+    assert_close(hg.load_gaussians(tmp_path / "a.glb"), scene(), STEPS[".glb"])
+    assert "lin_rec709_display" in caplog.text
