@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.avatar.export import VIDEOS
+from humangs_jax.avatar.export import EXPORTS, VIDEOS
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
-from humangs_jax.data.formats import MOTIONS
+from humangs_jax.data.formats import CAMERAS, MOTIONS
 
 TURN_SECONDS = 4.0
 """A turntable as a video turns once in this time."""
@@ -26,6 +26,8 @@ RATE, FINITE = Range(0.01, 1000.0), at_least(-LARGEST)
 VIDEO = Place(VIDEOS.suffixes, folder=True)
 _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
 FROM_THE_SIDE = Shot(azimuth=20.0)
+SPLATS = {suffix: each.up for each in EXPORTS.values() if not each.mesh for suffix in each.suffixes}
+"""Files of Gaussians, and the axis that points up in them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,18 +89,21 @@ class Animate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, or those of a capture.
+    """Render an avatar from a circle of cameras, or those of a capture; or Gaussians of any program.
 
     As images, as layers of an EXR file, or as a video of one turn (docs: video).
     """
 
     examples: ClassVar[tuple[str, ...]] = (
-        "humangs render avatar.npz --views 12 --out views",
         "humangs render avatar.npz --capture me --exr --out views",
+        "humangs render scene.ply --camera sparse/0 --out views",
     )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`."""
+    """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[Shot]
+    camera: Annotated[Path | None, arg(help=f"Of Gaussians: cameras of a file, in its world. {CAMERAS.listed()}")] = (
+        None
+    )
     out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = (
         Path("views")
     )
@@ -129,6 +134,10 @@ class Render:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         if self.capture is not None:
             self._require_defaults()
+        if self.avatar.suffix.lower() in SPLATS:
+            return self._render_gaussians(views)
+        if self.camera is not None:
+            raise UsageError(f"--camera: {self.avatar} is an avatar, which --capture gives cameras and poses")
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
@@ -161,6 +170,36 @@ class Render:
                 what = f"{written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
+
+    def _render_gaussians(self, views: int) -> None:
+        """Of a file of Gaussians."""
+        said = {"pose": self.pose != "t", "capture": self.capture, "exr": self.exr, "prune": self.shot.prune}
+        if wrong := [name for name, given in said.items() if given]:
+            raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
+        if self.camera is not None and (self.out.suffix or self.views is not None):
+            raise UsageError("--camera: expected a folder as --out, and no --views")
+        with stage("starting"):
+            from humangs_jax import load_gaussians
+            from humangs_jax.avatar.splat_views import circle_cameras, file_cameras, splat_images, write_splat_views
+            from humangs_jax.avatar.video import check_video, write_video
+
+            check_video(
+                self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != ""
+            )
+            shot = _drawn_by(self.shot, self.preset, self.config)
+        with stage("reading"):
+            gaussians = load_gaussians(self.avatar)
+            if self.camera is None:
+                cameras = circle_cameras(gaussians, SPLATS[self.avatar.suffix.lower()], views, shot)
+            else:
+                cameras = file_cameras(self.camera, shot)
+        with stage("drawing"):
+            if self.out.suffix:
+                count = write_video(self.out, splat_images(gaussians, cameras, shot), self.fps)
+                what = f"{count} frames of {_size(self.shot)} at {self.fps:g} frames per second"
+            else:
+                what = f"{write_splat_views(self.out, gaussians, cameras, shot)} views"
+        wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
     def _require_defaults(self) -> None:
         """With --capture nothing is said about the cameras. Raises: UsageError naming the first option that does."""

@@ -1,0 +1,93 @@
+"""`humangs render` of Gaussians of any program: from a circle, and from the cameras of a file."""
+
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import humangs_jax as hg
+from humangs_jax import cli
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.splat_views import circle_cameras, file_cameras
+from humangs_jax.io.images import read_image
+
+STEP = 0.51 / 255
+"""Half a step of 8 bits."""
+
+
+def ball(g=60, seed=0):
+    """Of 1 m around (1, 2, 3), colored by direction."""
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(g, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    arrays = d + np.asarray([1, 2, 3]), rng.normal(size=(g, 4)), np.full((g, 3), 0.1), np.full(g, 0.9), (d + 1) / 2
+    return hg.Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays))
+
+
+def rendered(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["humangs", "render", *map(str, words)])
+    cli.main()
+
+
+def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
+    hg.save_gaussians(tmp_path / "a.ply", ball())
+    out = tmp_path / "views"
+    rendered(monkeypatch, tmp_path / "a.ply", "--out", out, "--views", 3, "--size", 64, "--background", "black")
+    assert "3 views of 60 Gaussians" in capsys.readouterr().out
+    assert sorted(file.name for file in out.iterdir()) == ["view_000.png", "view_001.png", "view_002.png"]
+    loaded = hg.load_gaussians(tmp_path / "a.ply")
+    cameras = circle_cameras(loaded, "-y", 3, Shot(size=64))
+    for name, camera in cameras.items():
+        drawn = hg.render(loaded, camera, background="black")
+        np.testing.assert_allclose(read_image(out / f"{name}.png")[0], np.clip(drawn.rgb, 0, 1), atol=STEP)
+        assert np.mean(np.asarray(drawn.alpha) > 0.5) > 0.2 and np.asarray(drawn.alpha)[:2].max() < 0.1
+    # -y is up in a .ply: what has a small y is above
+    rgb, alpha = np.asarray(drawn.rgb), np.asarray(drawn.alpha)
+    green = (rgb[..., 1] * alpha).sum(1) / np.maximum(alpha.sum(1), 1e-6)
+    assert green[alpha.sum(1) > 5][0] < green[alpha.sum(1) > 5][-1]
+
+
+def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypatch):
+    gaussians, pose = ball(), np.eye(4)
+    pose[:3, 3] = [1, 2, 8]  # OpenGL's axes: looks along -z
+    frames = [{"file_path": f"images/{name}.jpg", "transform_matrix": pose.tolist()} for name in ("b", "a", "c/a")]
+    lens = {"fl_x": 60.0, "fl_y": 62.0, "cx": 25.0, "cy": 15.0, "w": 48, "h": 32}
+    (tmp_path / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    hg.save_gaussians(tmp_path / "a.ply", gaussians)
+    out = tmp_path / "views"
+    out.mkdir()
+    (out / "mine.txt").write_text("stays")
+    rendered(monkeypatch, tmp_path / "a.ply", "--camera", tmp_path / "transforms.json", "--out", out)
+    assert sorted(file.name for file in out.iterdir()) == ["a.png", "a_2.png", "b.png", "mine.txt"]
+    camera = hg.Camera.from_opencv(
+        [[60.0, 0, 25], [0, 62, 15], [0, 0, 1]], [[1, 0, 0, -1], [0, -1, 0, 2], [0, 0, -1, 8], [0, 0, 0, 1]], 48, 32
+    )
+    expected = np.clip(hg.render(gaussians, camera).rgb, 0, 1)
+    np.testing.assert_allclose(read_image(out / "b.png")[0], expected, atol=STEP + 1e-4)
+    assert np.mean(expected < 0.9) > 0.05
+    larger = file_cameras(tmp_path / "transforms.json", Shot(width=96, height=64))["b"]
+    assert (larger.width, larger.height) == (96, 64) and float(larger.K[0, 0]) == pytest.approx(120)
+
+
+MISUSES = {
+    "--exr: a.ply is no avatar": ["a.ply", "--exr"],
+    "--pose: a.ply is no avatar": ["a.ply", "--pose", "a"],
+    "--camera: me.npz is an avatar": ["me.npz", "--camera", "transforms.json"],
+    "--camera: expected a folder": ["a.ply", "--camera", "transforms.json", "--out", "x.mp4"],
+    "no.json: no such file": ["a.ply", "--camera", "no.json"],
+    "a.ply: no PLY file": ["a.ply"],
+}
+
+
+@pytest.mark.parametrize("message", MISUSES)
+def test_what_does_not_fit_is_one_line(message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    hg.save_gaussians(tmp_path / "a.ply", ball(3))
+    if message.startswith("a.ply: no"):
+        (tmp_path / "a.ply").write_bytes(b"solid")
+    with pytest.raises(SystemExit):
+        rendered(monkeypatch, *MISUSES[message])
+    said = capsys.readouterr().err.strip()
+    assert message in said and len(said.splitlines()) == 1 and not (tmp_path / "views").exists()
