@@ -471,5 +471,9 @@ def test_what_is_missing_is_said(tmp_path, caplog):
     (tmp_path / "tram").mkdir()
     load_motion(tram(camera=False)(tmp_path / "tram"), fps=30)
     assert "no camera.npy beside it: people move as the camera sees them" in caplog.text
+    frames = phalp()
+    del frames["_DEMO/000003.jpg"]["camera"]
+    with pytest.raises(MotionError, match=r"b\.pkl: frame 3: camera: missing, but frame 0 has it"):
+        load_motion(saved("b.pkl", frames)(tmp_path), person=3)
     with pytest.raises(MotionError, match="body_pose: expected rotation matrices"):
         load_motion(npz(**(smpl() | {"body_pose": np.ones((FRAMES, 23, 3, 3))}))(tmp_path))

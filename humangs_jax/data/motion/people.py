@@ -13,7 +13,7 @@ import numpy as np
 
 from humangs_jax.data.formats import MOTIONS, ArrayKeys
 from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.reading import FileError, check_limit, open_file, read_json
+from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, read_json
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 
@@ -235,7 +235,10 @@ def _stacked(frames: Sequence[tuple[Any, list[Person]]]) -> list[Person]:
         for _, file, values in seen:
             if missing := set(keys) - set(values):
                 where = first_file.name if isinstance(first_file, Path) else first_file
-                raise FileError(file, min(missing), f"missing, but {where} has it")
+                problem = f"missing, but {where} has it"
+                if not isinstance(file, Path):  # the file is named by who reads it
+                    raise Refused(f"{file}: {min(missing)}: {problem}")
+                raise FileError(file, min(missing), problem)
         values = {key: [objects(values[key]) for _, _, values in seen] for key in keys}
         values = {
             k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()
