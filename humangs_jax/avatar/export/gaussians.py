@@ -207,15 +207,13 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]]) -> Gaussians:
     return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()})
 
 
-def sigmoid(logits: Float[np.ndarray, " g"]) -> Float[np.ndarray, " g"]:
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits))
-
-
-def exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
-    """Infinite, which is refused, where it is too large."""
-    with np.errstate(over="ignore"):
-        return np.exp(logs)
+def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
+    """Unit quaternions of all components but one, which is not negative, and of its place among them."""
+    rest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
+    quats = np.empty((len(three), 4))
+    for i in range(4):
+        quats[places == i] = np.insert(three, i, rest, axis=1)[places == i]
+    return quats
 
 
 def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:

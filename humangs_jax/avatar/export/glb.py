@@ -12,7 +12,6 @@ import numpy as np
 
 from humangs_jax.avatar.export.gaussians import colors_of, linear_of, loaded, plain_arrays, sh_of
 from humangs_jax.core.array_types import Float
-from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion.gltf import node_matrices
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, shown
@@ -83,12 +82,8 @@ def read_glb(data: bytes) -> Gaussians:
     if spaces != {shown(SRGB)}:
         logger.warning("colors of %s are taken as they are: images of them have these colors, too", ", ".join(spaces))
     parts = [_part(content, binary, part["attributes"], place) for part, place in placed]
-    most = max(0 if part.harmonics is None else part.harmonics.shape[1] for part in parts)
-    if most and len(parts) > 1:
-        none = [jnp.zeros((len(part.means), 0, 3)) for part in parts]
-        given = [zeros if part.harmonics is None else part.harmonics for part, zeros in zip(parts, none, strict=True)]
-        padded = [jnp.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in given]
-        parts = [replace(part, harmonics=each) for part, each in zip(parts, padded, strict=True)]
+    if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
+        raise Refused("parts with harmonics of different degrees: expected one degree")
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
 
 

@@ -15,8 +15,9 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import expit
 
-from humangs_jax.avatar.export.gaussians import colors_of, exponential, loaded, plain_arrays, sh_of, sigmoid
+from humangs_jax.avatar.export.gaussians import colors_of, loaded, plain_arrays, sh_of, with_largest
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.io.atomic import replace_file
@@ -83,11 +84,15 @@ def read_ply(data: bytes) -> Gaussians:
     arrays = {
         "x, y, z": _columns(vertex, *"xyz"),
         "rot_*": _columns(vertex, *(f"rot_{i}" for i in range(4))),
-        "scale_*": exponential(_columns(vertex, *(f"scale_{i}" for i in range(3)))),
-        "opacity": sigmoid(_columns(vertex, "opacity")[:, 0]),
+        "scale_*": _exponential(_columns(vertex, *(f"scale_{i}" for i in range(3)))),
+        "opacity": expit(_columns(vertex, "opacity")[:, 0]),
         "f_dc_*": colors_of(_columns(vertex, *(f"f_dc_{i}" for i in range(3)))),
     }
     return loaded(arrays | _harmonics(vertex))
+
+
+def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
+    return np.exp(np.minimum(logs, 99))  # far too large, so refused
 
 
 def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, Float[np.ndarray, "g k 3"]]:
@@ -114,16 +119,11 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns) -> Gaussians:
         low, high = (_columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max"))
         return np.repeat(low, CHUNK, axis=0)[:count] * (1 - part) + np.repeat(high, CHUNK, axis=0)[:count] * part
 
-    three = (bits["rotation"] - 0.5) * np.sqrt(2)
-    largest, rest = words["rotation"] >> 30, np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
-    quats = np.empty((count, 4))
-    for i in range(4):
-        quats[largest == i] = np.insert(three, i, rest, axis=1)[largest == i]
     colors = bits["color"][:, :3]
     arrays = {
         "packed_position": between(bits["position"], *"xyz"),
-        "packed_rotation": quats,
-        "packed_scale": exponential(between(bits["scale"], "scale_x", "scale_y", "scale_z")),
+        "packed_rotation": with_largest((bits["rotation"] - 0.5) * np.sqrt(2), words["rotation"] >> 30),
+        "packed_scale": _exponential(between(bits["scale"], "scale_x", "scale_y", "scale_z")),
         "opacity": bits["color"][:, 3],
         "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
     }

@@ -14,7 +14,7 @@ import struct
 
 import numpy as np
 
-from humangs_jax.avatar.export.gaussians import colors_of, loaded, plain_arrays, sh_of
+from humangs_jax.avatar.export.gaussians import colors_of, loaded, plain_arrays, sh_of, with_largest
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked
@@ -103,7 +103,7 @@ def read_spz(data: bytes) -> Gaussians:
     padded = np.pad(positions.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # the lowest of four bytes
     arrays = {
         "positions": np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits),
-        "rotations": _first_three(quats) if version == 2 else _smallest_three(quats),
+        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count)) if version == 2 else _smallest_three(quats),
         "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
         "alphas": opacities[:, 0] / 255,
         "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
@@ -112,24 +112,9 @@ def read_spz(data: bytes) -> Gaussians:
     return loaded(arrays if degree else {name: arrays[name] for name in list(arrays)[:5]})
 
 
-def _first_three(packed: UInt8[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 4"]:
-    """Quaternions (wxyz) of version 2: x, y and z; w is not negative."""
-    xyz = packed / 127.5 - 1
-    return np.column_stack([_rest(xyz), xyz])
-
-
 def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
     """Inverse of `_packed_quaternions`."""
     word = np.ascontiguousarray(packed).view("<u4")[:, 0]
     signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)
-    three /= QUATERNION_STEPS * np.sqrt(2)
-    xyzw = np.empty((len(word), 4))
-    for i in range(4):
-        xyzw[word >> 30 == i] = np.insert(three, i, _rest(three), axis=1)[word >> 30 == i]
-    return xyzw[:, [3, 0, 1, 2]]
-
-
-def _rest(three: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, " g"]:
-    """The component that makes three others a unit quaternion."""
-    return np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
+    return with_largest(three / (QUATERNION_STEPS * np.sqrt(2)), word >> 30)[:, [3, 0, 1, 2]]
