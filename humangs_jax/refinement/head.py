@@ -33,6 +33,8 @@ LEAST_SIDE = 512
 """Pixels of the photos' longer side from which heads show more than the iterations leave."""
 LARGEST_HEAD = 112
 """Pixels: photos are reduced until heads are no larger."""
+LOOK = 1024
+"""Pixels of the photos' longer side in which heads are looked for, at most; crops are of photos of twice that at most."""
 SIDES = 32
 """Sides of the crops are multiples of it, pixels."""
 SIMILAR = 1.25
@@ -137,14 +139,14 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     if not sure.any():
         return None
     longest = max(capture.images.shape[1:3])
-    size = min(longest, image_size or longest)
+    others = min(longest, image_size or longest)
+    size = min(others, LOOK)
     views = crop_to_person(capture, size)
-    middles, side = _squares(_pixels(avatar, views)[:, sure])
-    finer, wanted = False, min(longest, round(size * LARGEST_HEAD / side))
+    seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)
+    wanted = min(longest, 2 * size, round(size * LARGEST_HEAD / side))
     if not 1 / SIMILAR < wanted / size < SIMILAR:
-        finer, views = wanted > size, crop_to_person(capture, wanted)
-        middles, side = _squares(_pixels(avatar, views)[:, sure])
-    seen = np.flatnonzero(((middles >= 0) & (middles < views.masks.shape[1:])).all(axis=1))
+        size, views = wanted, crop_to_person(capture, wanted)
+        seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)
     if not len(seen):
         return None
     half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
@@ -159,7 +161,7 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     drawn = np.sort(np.argsort(~shown, kind="stable")[: _power(int(shown.sum()))])
     splat = planned(avatar, views)  # of all Gaussians, by programs that there are already
     buffers = {name: _power(getattr(splat, name)) for name in BUFFERS}
-    return Crops(moved, drawn, views, finer, dataclasses.replace(splat, visibility=False, **buffers))
+    return Crops(moved, drawn, views, size > others, dataclasses.replace(splat, visibility=False, **buffers))
 
 
 def _power(number: int) -> int:
@@ -179,7 +181,11 @@ def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
 _projected = jax.jit(project)
 
 
-def _squares(pixels: Float[np.ndarray, "v g 2"]) -> tuple[Float[np.ndarray, "v 2"], int]:
-    """(y, x) of the middles of the squares in which most points lie in each view, and their side, pixels."""
+def _squares(
+    pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
+) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
+    """The views that show most of the points; (y, x) of the middles of the squares that these fill, and the largest side."""
     low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[..., ::-1]
-    return (low + high) / 2, max(1, int(np.ceil((high - low).max())))
+    middles, sides, frame = (low + high) / 2, (high - low).max(axis=1), views.masks.shape[1:]
+    seen = np.flatnonzero(((middles >= 0) & (middles < frame)).all(axis=1) & (sides <= max(frame)))
+    return seen, middles, max(1, int(np.ceil(sides[seen].max(initial=1))))

@@ -64,6 +64,18 @@ def test_crops_show_the_head(four):
     assert set(np.flatnonzero(crops.moved)) <= set(crops.drawn.tolist())
     assert len(crops.views.images) == 4 and crops.views.cameras.height < HEIGHT
     assert float(crops.views.masks.mean()) > 0.2
+    larger = head_crops(avatar, capture, HEIGHT // 2)  # of the photos as they are
+    assert larger.finer and not crops.finer
+    np.testing.assert_allclose(larger.views.cameras.K[:, 0, 0], crops.views.cameras.K[:, 0, 0], rtol=1e-6)
+
+
+def test_a_camera_that_has_the_head_behind_it_is_left_out(four):
+    avatar, views = four[0], crop_to_person(four[1])
+    placed = views.cameras.cam_from_world
+    turned = placed.at[0].set(jnp.diag(jnp.asarray([-1.0, 1, -1, 1])) @ placed[0])
+    views = replace(views, cameras=replace(views.cameras, cam_from_world=turned))
+    seen, _, side = heads._squares(heads._pixels(avatar, views)[:, of_head(avatar)], views)
+    assert seen.tolist() == [1, 2, 3] and side < HEIGHT
 
 
 @pytest.mark.parametrize("spoil", ["no head", "nobody opaque", "out of the frame"])
