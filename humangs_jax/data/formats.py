@@ -243,17 +243,7 @@ def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None
 
 _FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
 _PARTS = f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
-_OF_CAMERA = (
-    "trans",
-    "transl",
-    "cam_t",
-    "pred_cam_t_full",
-    "pred_cam_t",
-    "camera",
-    "cam_trans",
-    "translation",
-    "orig_cam",
-)
+_OF_CAMERA = tuple("trans transl cam_t pred_cam_t_full pred_cam_t camera cam_trans translation orig_cam".split())
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
 """Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
@@ -306,7 +296,9 @@ MOTIONS = Formats(
     smplx=_arrays("SMPL-X (fullpose)", "fullpose", "all=fullpose", up="z"),
     prompthmr=_arrays("PromptHMR", "rotmat shape", "all=rotmat", use=_ALONE),
     camera=_arrays("PromptHMR, CamSMPLify", "pose shape", "all=pose", use=_ALONE),
-    vibe=_arrays("VIBE", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
+    vibe=_arrays("VIBE", "pose pred_cam", "all=pose", use=_ALONE | {"stays": True}),
+    tcmr=_arrays("TCMR", "pose verts", "all=pose", use=_ALONE | {"stays": True}),
+    local=_arrays("WHAM of one camera", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
     smpl=_arrays("SMPL (pose)", "pose", "all=pose", up="z", also=("y", "-y")),
     bvh=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.bvh:read_bvh", (".bvh",)),
     glb=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.gltf:read_animation", (".glb", ".vrma")),

@@ -20,6 +20,7 @@ from bvh_files import (
     without_twist,
     write_bvh,
 )
+from joint_names import NAMED
 from motion_cases import UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
@@ -193,74 +194,6 @@ def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
     assert np.ptp(ours[:, 0, 1]) > 0.3  # they were squats
 
 
-def renamed(limbs, form="{side}{limb}", **middle):
-    """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as given."""
-    parts = dict(
-        zip(("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"), limbs.split(), strict=True)
-    )
-    names = {
-        "pelvis": "Hips",
-        "spine1": "Spine",
-        "spine2": "Chest",
-        "spine3": "UpperChest",
-        "neck": "Neck",
-        "head": "Head",
-    } | middle
-    sided = lambda ours: form.format(
-        side=ours.split("_")[0].title(), s=ours[0], S=ours[0].upper(), limb=parts[ours.split("_")[1]]
-    )
-    return {ours: sided(ours) if "_" in ours else names[ours] for ours in CMU}
-
-
-NAMED = {
-    "a common beginning": {ours: f"Model_{theirs}" for ours, theirs in CMU.items()},
-    "a common end": {ours: f"{theirs}_JNT" for ours, theirs in CMU.items()},
-    "SMPL": {ours: ours for ours in CMU},
-    "SMPL, L_": {ours: ours.replace("left_", "L_").replace("right_", "R_") for ours in CMU},
-    "Unreal": renamed(
-        "clavicle upperarm lowerarm hand thigh calf foot ball", "{limb}_{s}", pelvis="pelvis", neck="neck_01"
-    ),
-    "Unity": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes"),
-    "VRM": renamed(
-        "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase", "J_Bip_{S}_{limb}", pelvis="J_Bip_C_Hips"
-    ),
-    "Bandai-Namco": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes", "{limb}_{S}"),
-    "Xsens": renamed(
-        "Shoulder UpperArm ForeArm Hand UpperLeg LowerLeg Foot Toe",
-        pelvis="Pelvis",
-        spine1="L5",
-        spine2="L3",
-        spine3="T8",
-    ),
-    "SOMA": renamed("Shoulder Arm ForeArm Hand Leg Shin Foot ToeBase", neck="Neck1"),
-    "Rocketbox": renamed(
-        "Clavicle UpperArm Forearm Hand Thigh Calf Foot Toe0", "Bip01 {S} {limb}", pelvis="Bip01 Pelvis"
-    ),
-    "Rigify": renamed(
-        *("shoulder upper_arm forearm hand thigh shin foot toe", "DEF-{limb}.{S}"),
-        **{"pelvis": "DEF-spine", "neck": "DEF-spine.004", "head": "DEF-spine.006"}
-        | {f"spine{i}": f"DEF-spine.00{i}" for i in (1, 2, 3)},
-    ),
-    "JNT": renamed(
-        "clav uparm loarm hand upleg loleg foot ball", "{s}_{limb}_JNT", pelvis="c_root_JNT", neck="neck_JNT"
-    ),
-    "Daz": renamed(
-        "Collar ShldrBend ForearmBend Hand ThighBend Shin Foot Toe", "{s}{limb}", pelvis="hip", neck="neckLower"
-    ),
-    "Advanced Skeleton": renamed(
-        "Scapula Shoulder Elbow Wrist Hip Knee Ankle Toes", "{limb}_{S}", pelvis="Root_M", head="Head_M"
-    ),
-    "behind": renamed("Shoulder Arm ForeArm Hand UpLeg Leg Foot ToeBase", "{limb}Left", pelvis="Hips")
-    | {ours: f"{theirs}.R" for ours, theirs in CMU.items() if ours.startswith("right")},
-    "numbers": {ours: f"Joint_{i:02d}" for i, ours in enumerate(CMU)},
-    "numbers backwards": {ours: f"bone{40 - i}" for i, ours in enumerate(CMU)},
-    "unknown words": {ours: f"part {i * 7919 % 1000}" for i, ours in enumerate(CMU)},
-}
-NAMED["behind"] |= {
-    ours: name.replace("Right", "") for ours, name in NAMED["behind"].items() if ours.startswith("right")
-}
-
-
 @pytest.mark.parametrize("scheme", NAMED)
 def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
     rest, poses = person(), dance(3, names=CMU, scale=0.2)
@@ -352,7 +285,18 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
 
 
 def write_glb(
-    path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR", more=(), titles=()
+    path,
+    rest,
+    poses,
+    moves,
+    names,
+    bind=None,
+    fps=24.0,
+    above=None,
+    interpolation="LINEAR",
+    more=(),
+    titles=(),
+    **more_of_file,
 ):
     """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
@@ -393,7 +337,7 @@ def write_glb(
             animate(place[name], "rotation", Rotation.from_rotvec(each[:, INDEX[name]]).as_quat())
         animate(0, "translation", moves)
         animations.append({"channels": channels, "samplers": samplers} | ({"name": titles[i]} if titles else {}))
-    writer.write(path, document | {"animations": animations})
+    writer.write(path, document | {"animations": animations} | more_of_file)
 
 
 @pytest.mark.parametrize("interpolation", ["LINEAR", "CUBICSPLINE", "STEP"])
@@ -433,6 +377,26 @@ def test_a_clip_of_several_is_chosen_by_name_or_number(tmp_path, caplog):
     assert caplog.text.count("3 animations (Idle, Run, Walk): the first is taken") == 1
     with pytest.raises(MotionError, match=r"a\.vrma: clip Jump: expected one of Idle, Run, Walk"):
         load_motion(tmp_path / "a.vrma", rest_joints=rest, clip="Jump")
+
+
+def test_bones_of_a_vrm_are_those_that_it_says(tmp_path):
+    rest, poses = person(), dance(3, names=CMU)
+    words = dict(
+        zip(
+            ["collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"],
+            (*("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes"),),
+            strict=True,
+        )
+    )
+    middle = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest"}
+    bones = {o: o.split("_")[0] + words[o.split("_")[1]] if "_" in o else middle.get(o, o) for o in CMU}
+    joints = [name for name in JOINT_NAMES if name in CMU]
+    human = {bones[name]: {"node": i} for i, name in enumerate(joints)}
+    scrambled = {name: f"L_thing {i * 37 % 101}" for i, name in enumerate(joints)}
+    extensions = {"VRMC_vrm_animation": {"humanoid": {"humanBones": human}}}
+    write_glb(tmp_path / "a.vrma", rest, poses, np.zeros((3, 3)), scrambled, extensions=extensions)
+    motion = load_motion(tmp_path / "a.vrma", rest_joints=rest)
+    np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
 
 
 def test_glb_files_that_are_no_motion(tmp_path):

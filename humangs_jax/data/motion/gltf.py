@@ -49,7 +49,8 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip:
     bind = np.stack([binding.get(joint, rest[joint][0]) for joint in joints])
     matrices = np.stack([posed[joint] for joint in joints], axis=1)
     turns = _rotations(matrices) @ np.swapaxes(_rotations(bind), -1, -2)
-    names = tuple(str(nodes[joint].get("name", "")) for joint in joints)
+    bones = _humanoid(content)
+    names = tuple(bones.get(joint, str(nodes[joint].get("name", ""))) for joint in joints)
     above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
     return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said)
 
@@ -71,6 +72,23 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
     if clip.isdecimal() and int(clip) < len(names):
         return animations[int(clip)], ""
     raise Refused(f"clip {clip}: expected one of {listed}")
+
+
+def _humanoid(content: dict[str, Any]) -> dict[int, str]:
+    """Names of the bones by node, of files that say them (VRM and its animations): nodes may be called anything."""
+    extensions = content.get("extensions")
+    for each in extensions.values() if isinstance(extensions, dict) else ():
+        bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
+        if isinstance(bones, list):  # of VRM 0
+            bones = {str(bone.get("bone")): bone for bone in bones if isinstance(bone, dict)}
+        named = {
+            bone["node"]: name
+            for name, bone in bones.items()
+            if isinstance(bone, dict) and type(bone.get("node")) is int
+        }
+        if named:
+            return named
+    return {}
 
 
 def _parents(nodes: Nodes) -> list[int]:
