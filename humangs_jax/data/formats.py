@@ -243,7 +243,10 @@ def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None
 
 _FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
 _PARTS = f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
-_OF_CAMERA = tuple("trans transl cam_t pred_cam_t_full pred_cam_t camera cam_trans translation orig_cam".split())
+_OF_CAMERA = (
+    *("trans", "transl", "cam_t", "pred_cam_t_full", "pred_cam_t"),
+    *("camera", "cam_trans", "translation", "orig_cam"),
+)
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
 """Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
