@@ -23,7 +23,7 @@ ITERATIONS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
 
 HEAD_STEPS = 500
-"""As many as 4 s allow on two cores."""
+"""They take 4 s of one core, for photos of 512 pixels."""
 
 
 @configuration
@@ -62,7 +62,7 @@ class RefineConfig:
         HEAD_STEPS, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
     )
     """Steps on the head alone afterwards, where photos have 512 pixels or more, `seconds` is None or `steps` 0; 0: none. They
-    move the Gaussians of the head by crops of the photos around it, and let nothing grow beyond the masks (see `head.py`)."""
+    move the Gaussians of the head by crops of the photos around it, and hold back what grows beyond the masks (see `head.py`)."""
     image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
     structural: Weight = 0.2

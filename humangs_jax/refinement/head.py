@@ -1,7 +1,7 @@
 """Detail where people look: steps on the head alone, in crops of the photos around it.
 
 Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks, and alpha beyond a mask costs
-more than in steps on the whole person, so that no coverage grows at the silhouette.
+more than in steps on the whole person, so that little coverage grows at the silhouette.
 """
 
 import dataclasses
