@@ -131,7 +131,7 @@ def _intrinsics(
         elif f"camera_angle_{axis}" in values and side is not None:
             focal[axis] = 0.5 * side / np.tan(0.5 * _number(values, f"camera_angle_{axis}", file, prefix))
     if not focal:
-        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x, camera_angle_x or K")
+        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
     assert {"cx", "cy"} <= values.keys() or None not in (width, height)  # the caller has asked the photo
     cx, cy = (
