@@ -45,6 +45,7 @@ PICTURES = {
     "numerical_stability": 9,
     "quickstart": 27,
     "speed_and_accuracy": 12,
+    "splatting": 0,
     "splatting_from_the_inside": 1,
     "systems_compared": 0,
     "training": 4,
