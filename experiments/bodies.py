@@ -14,8 +14,9 @@ from experiments.quality import COLUMNS, cells
 from experiments.results import markdown_table
 from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import EXPRESSION_COLUMNS, SHAPE_COLUMNS, load_body
-from humangs_jax.body.model import JOINT_NAMES, BodyModel
+from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import JOINT_NAMES, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.people.subject import split_of
 from humangs_jax.people.writer import Layout, write_person

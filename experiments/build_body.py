@@ -22,8 +22,9 @@ from scipy.optimize import nnls
 
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import save_body
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyModel
+from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import collapse_sequence
 
 METRES = 0.1  # MakeHuman works in decimetres

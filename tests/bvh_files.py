@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import FINGERS, JOINT_NAMES, PARENTS
 
 INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 _LIMBS = {

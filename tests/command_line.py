@@ -7,7 +7,7 @@ import numpy as np
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.model import JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.rendering.gaussians import Gaussians
 
 

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import JOINT_NAMES
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.data.motion.rules import joint_places
 from humangs_jax.data.motion.skeleton import shipped_joints
 

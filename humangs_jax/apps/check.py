@@ -22,7 +22,8 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.quick_check import faults
 from humangs_jax.avatar.sheets import contact_sheet, tile
-from humangs_jax.body.model import FINGERS, BodyModel, BodyPose, person_vertices, pose_body, shape_body
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace

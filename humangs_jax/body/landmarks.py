@@ -30,9 +30,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import (
     EXACT,
-    FINGERS,
     BodyModel,
     BodyPose,
     SurfacePoints,

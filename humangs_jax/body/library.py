@@ -17,7 +17,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyModel, BodyPose
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass

@@ -21,8 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
-from humangs_jax.body.model import BODY_NAMES, BodyPose
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
 from humangs_jax.body.model import (
-    BODY_NAMES,
     EXACT,
     BodyModel,
     BodyPose,

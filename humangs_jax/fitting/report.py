@@ -12,7 +12,8 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import EXACT, FINGERS, BodyPose
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import EXACT, BodyPose
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.progress import text_table
 from humangs_jax.data.capture import Capture

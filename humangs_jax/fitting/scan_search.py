@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import BODY_NAMES, BodyPose
+from humangs_jax.body.joints import BODY_NAMES
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.landmark_fit import cube_rotations

@@ -22,7 +22,8 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import EXACT, FINGERS, BodyPose
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import EXACT, BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform

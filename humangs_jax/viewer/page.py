@@ -22,8 +22,9 @@ import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import light_values
+from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import PARENTS, BodyModel, RestBody
+from humangs_jax.body.model import BodyModel, RestBody
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.configuration import ArgumentError, config_from_json

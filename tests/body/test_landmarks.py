@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from rounding import bound
 
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import Place, landmark_model, pose_landmarks
-from humangs_jax.body.model import JOINT_NAMES, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67, mirrored_name

@@ -11,8 +11,9 @@ from body_cases import areas, is_closed, made_up_body, signed_volume
 from scipy.spatial import cKDTree
 
 from humangs_jax.body import library
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 
 MEGABYTE = 1e6

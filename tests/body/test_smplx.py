@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import assemble_pose, load_body, load_hands, load_smplx
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, pose_body, shape_body, without_expression
+from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
 
 DATA = Path(__file__).parent / "data"
 MODEL, ARRAYS = DATA / "smplx_reduced_model.npz", DATA / "smplx_reduced_arrays.npz"

@@ -10,8 +10,9 @@ from command_line import run
 from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import HandBasis
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, RestBody, joint_transforms
+from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.cli import animate
 from humangs_jax.core.registry import imported
 from humangs_jax.data.formats import MOTIONS, MotionFormat

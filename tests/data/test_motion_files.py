@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import PELVIS, UPRIGHT, MotionError, load_motion
 from humangs_jax.data.motion.mhr import COUNT, JOINTS
 from humangs_jax.data.motion.rules import joint_places

@@ -24,7 +24,7 @@ from joint_names import NAMED
 from motion_cases import UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import MotionError, load_motion
 from humangs_jax.data.motion.bvh import read_bvh
 from humangs_jax.data.motion.skeleton import retargeted, shipped_joints

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from experiments import bodies
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import JOINT_NAMES, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.presets import tiny

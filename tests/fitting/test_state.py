@@ -12,8 +12,9 @@ from toy_body import MODEL
 from humangs_jax.apps import check
 from humangs_jax.avatar.export.gaussians import turned
 from humangs_jax.body import model
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import pose_landmarks
-from humangs_jax.body.model import JOINT_NAMES, BodyModel, BodyPose, person_vertices, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.fitting import fit_capture, landmark_fit

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyModel
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyModel
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.fitting.files import KEYS, OPTIONAL

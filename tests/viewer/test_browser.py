@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from experiments import chromium
 from experiments import page as evaluation
 from experiments.subjects import shipped_person
-from humangs_jax.body.model import JOINT_NAMES, PARENTS, BodyPose, RestBody, joint_transforms
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
 from humangs_jax.geometry import transform

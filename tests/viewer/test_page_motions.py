@@ -12,7 +12,7 @@ from bvh_files import CMU, INDEX, LAFAN, MIXAMO, frames_along_bones, rest_frames
 from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.formats import MOTIONS
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints

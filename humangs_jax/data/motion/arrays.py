@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import JOINT_NAMES
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
 from humangs_jax.data.motion import skeleton

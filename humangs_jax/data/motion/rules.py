@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import BODY_NAMES, FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES, PARENTS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
 from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, PLACES

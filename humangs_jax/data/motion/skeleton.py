@@ -27,8 +27,8 @@ from importlib import resources
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import read_body
-from humangs_jax.body.model import JOINT_NAMES, PARENTS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion.matching import matched
 from humangs_jax.data.motion.rules import (

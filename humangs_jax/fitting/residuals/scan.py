@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
+from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
-from humangs_jax.body.model import FINGERS, BodyModel, BodyPose, SurfacePoints, pose_features, pose_points
+from humangs_jax.body.model import BodyModel, BodyPose, SurfacePoints, pose_features, pose_points
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import PARENTS
+from humangs_jax.body.joints import PARENTS
 from humangs_jax.data.datasets.bodies import FileBody
 
 VERTICES, COLUMNS, FRAMES, CAMERAS = 80, 10, 3, 2
