@@ -50,8 +50,8 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 
 def format_table(name: str) -> str:
-    """The "cameras" or "keypoints" that are read, as a table in Markdown."""
-    from humangs_jax.data.formats import CAMERAS, KEYPOINTS
+    """The "cameras", "keypoints" or "motions" that are read, as a table in Markdown."""
+    from humangs_jax.data.formats import CAMERAS, KEYPOINTS, MOTIONS
 
     centers = {"half": "+0.5", "integer": "whole numbers"}
     quoted = lambda files: ", ".join(f"`{file}`" for file in files)
@@ -67,6 +67,20 @@ def format_table(name: str) -> str:
                 ("camera", "image")[each.per_image],
             )
             for each in CAMERAS.values()
+        ]
+    elif name == "motions":
+        header = ("of", "keys that tell it", "up", "frames per second, where the file has none")
+        arrays = [(each.about, each.arrays) for each in MOTIONS.values() if each.arrays is not None]
+        rows = [
+            (
+                about,
+                quoted(each.keys),
+                each.up
+                if each.fixed or not each.also
+                else f"{each.up}, or {', '.join(each.also)} where people stand so",
+                "must be given" if each.fps is None else f"{each.fps:g}",
+            )
+            for about, each in arrays
         ]
     else:
         header = ("format", "usual names", "content")

@@ -104,7 +104,7 @@ class Reconstruct:
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
     refine: str | None = None
-    """How long to fit an avatar to its photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
+    """Fit the avatar to its photos for so long: 15s, 100steps, or 0. Default, with masks: iterations and the head."""
     preset: Preset | None = None
     """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the options above."""
     config: Path | None = None

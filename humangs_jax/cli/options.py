@@ -219,7 +219,7 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 
 
 ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
-"""Of refinement, where nothing is asked for: one to two seconds, however large the photos."""
+"""Of refinement, where nothing is asked for: some seconds, however large the photos."""
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class Start:
     fit_masks: bool = True
     """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
     refine: str | None = None
-    """How long to fit the avatar to the photos: 15s, 100steps, or 0. Default, with masks: the 1 to 2 s of learned iterations."""
+    """Fit the avatar to the photos for so long: 15s, 100steps, or 0. Default, with masks: iterations and the head."""
     browser: bool = True
     """Do not open the page at the end."""
     overwrite: bool = False
