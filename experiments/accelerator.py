@@ -57,9 +57,7 @@ def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: boo
     """
     makers = {"check": check, "splatting": splatting, "network": network, "frames": frames, "batch": batch_sizes}
     settings = {"device": jax.devices()[0].device_kind, "small": small}
-    cases = {
-        f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in makers[name](small)
-    }
+    cases = {f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in makers[name](small)}
     found = run.rows(cases, settings)
     rows = [
         [what, key, f"{value:.4g}" if isinstance(value, float) else str(value)]

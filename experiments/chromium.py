@@ -82,9 +82,7 @@ class Chromium:
     def run(self, script: str, *arguments: Any) -> Any:
         """Run the body of an async function in the page; its value, promises awaited. Raises: RuntimeError if it throws."""
         code = "const done = arguments[arguments.length - 1], given = [...arguments].slice(0, -1);"
-        code += (
-            f"(async () => {{ {script} }})().then((v) => done([v, null]), (e) => done([null, String(e.stack || e)]))"
-        )
+        code += f"(async () => {{ {script} }})().then((v) => done([v, null]), (e) => done([null, String(e.stack || e)]))"
         value, error = self.driver.execute_async_script(code, *arguments)
         if error is not None:
             raise RuntimeError(error)

@@ -40,9 +40,7 @@ class Costs:
     def times(self, count: int) -> "Costs":
         """That often."""
         often = lambda counter: Counter({key: count * number for key, number in counter.items()})
-        return Costs(
-            count * self.dots, count * self.convolutions, self.unknown_trips, often(self.messages), often(self.sent)
-        )
+        return Costs(count * self.dots, count * self.convolutions, self.unknown_trips, often(self.messages), often(self.sent))
 
 
 def costs_of(traced: Any) -> Costs:

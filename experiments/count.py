@@ -41,9 +41,7 @@ def count(run: Run, before: Path | None = None, details: bool = False) -> None:
         for name, value in columns["now"].items():
             if isinstance(value, list):
                 print(f"{name}: {', '.join(map(str, value)) or 'none'}")
-    shown = lambda value: (
-        f"{len(value) if isinstance(value, list) else value:,}" if not isinstance(value, str) else value
-    )
+    shown = lambda value: f"{len(value) if isinstance(value, list) else value:,}" if not isinstance(value, str) else value
     rows = [[name, *(shown(column.get(name, "")) for column in columns.values())] for name in columns["now"]]
     numbers = {
         title: {name: len(value) if isinstance(value, list) else value for name, value in column.items()}
@@ -54,9 +52,7 @@ def count(run: Run, before: Path | None = None, details: bool = False) -> None:
 
 def measure(root: Path) -> dict[str, Any]:
     """Numbers, shares as text, and lists of names."""
-    files = subprocess.run(
-        ["git", "ls-files"], cwd=root, capture_output=True, text=True, check=True
-    ).stdout.splitlines()
+    files = subprocess.run(["git", "ls-files"], cwd=root, capture_output=True, text=True, check=True).stdout.splitlines()
     known = [name for name in files if (root / name).is_file()]
     python = {name: (root / name).read_text() for name in known if name.endswith(".py")}
     of = lambda *folders: {name: text for name, text in python.items() if name.startswith(folders)}
@@ -70,9 +66,7 @@ def measure(root: Path) -> dict[str, Any]:
     pages = [name for name in known if name == "README.md" or (name.startswith("docs/") and name.endswith(".md"))]
     found |= {"docs: pages": len(pages), "docs: words": sum(len((root / name).read_text().split()) for name in pages)}
     by_hand = {name: written((root / name).read_text()) for name in pages if not name.startswith(GENERATED)}
-    found["docs: words by hand, without code and generated tables"] = sum(
-        len(text.split()) for text in by_hand.values()
-    )
+    found["docs: words by hand, without code and generated tables"] = sum(len(text.split()) for text in by_hand.values())
     found["docs: words of README"] = len((root / "README.md").read_text().split())
     found["docs: tables on pages written by hand"] = sum(text.count("| --- ") > 0 for text in by_hand.values())
     found["docs: terms of another dialect"] = [
@@ -183,9 +177,7 @@ def imports(package: dict[str, str], at_import: bool) -> dict[str, set[str]]:
             else:
                 names += [each.name for each in node.names]
         # a name of a module is an import of that module
-        found[module] = {each if each in modules else each.rpartition(".")[0] for each in names} & set(modules) - {
-            module
-        }
+        found[module] = {each if each in modules else each.rpartition(".")[0] for each in names} & set(modules) - {module}
     return found
 
 
@@ -202,11 +194,7 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
         return seen
 
     reach = {module: reached(module) for module in graph}
-    found = {
-        frozenset(other for other in reach[module] if module in reach[other])
-        for module in graph
-        if module in reach[module]
-    }
+    found = {frozenset(other for other in reach[module] if module in reach[other]) for module in graph if module in reach[module]}
     return [" <-> ".join(sorted(each)) for each in found]
 
 

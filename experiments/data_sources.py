@@ -85,9 +85,7 @@ def write_set(layout: str, out: Path) -> tuple[Path, Path]:
     return folder, out / "body.npz"
 
 
-def measure_preprocessing(
-    out: Path, sets: dict[str, tuple[Path, Path]], kinds: Sequence[str], views: int
-) -> dict[str, Any]:
+def measure_preprocessing(out: Path, sets: dict[str, tuple[Path, Path]], kinds: Sequence[str], views: int) -> dict[str, Any]:
     """Seconds for a view of each kind, one process, compilation apart."""
     results = {}
     for kind in kinds:

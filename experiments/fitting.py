@@ -99,10 +99,7 @@ def walking(seeds, kind, frames, views, size=512):
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
     """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share displaced by up to so far."""
     rng = np.random.default_rng([seed, ERROR_STREAM])
-    seen = (
-        np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks)
-        + case.cam_from_world[..., None, :3, 3]
-    )
+    seen = np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks) + case.cam_from_world[..., None, :3, 3]
     pixels = seen[..., :2] / seen[..., 2:] * case.K[..., None, [0, 1], [0, 1]] + case.K[..., None, :2, 2]
     pixels = pixels + rng.normal(0, 1, pixels.shape) * noise_px
     wild = rng.random(pixels.shape[:-1]) < outliers
@@ -270,9 +267,7 @@ def fit_sequences(
     model, made = walking(range(FIRST, FIRST + people), kind, FRAMES, 4)
     ways = {"alone": 0.0} | {f"smooth {s:g}": s for s in smoothness}
     names = cases or tuple(CASES)
-    each = {
-        f"{name}: {way}": functools.partial(measure, model, made, name, s) for name in names for way, s in ways.items()
-    }
+    each = {f"{name}: {way}": functools.partial(measure, model, made, name, s) for name in names for way, s in ways.items()}
     rows = run.rows(each, {"people": people, "kind": kind})
     show = lambda value: "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
     keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
@@ -321,9 +316,7 @@ def spoiled(model, people, name: str):
         points[:, rows] = np.asarray(others.points)[:, [(row + FRAMES // 2) % FRAMES for row in rows]]
     elif "px off" in name:
         points[:, rows] = np.asarray(observe(people, FIRST, noise, 0.2, model).points)[:, rows]
-    noises = np.stack(
-        [expected_noise(p, c) for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)]
-    )
+    noises = np.stack([expected_noise(p, c) for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)])
     each = {"points": points, "confidences": confidences, "K": seen.K, "cam_from_world": seen.cam_from_world}
     return replace(seen, **{key: value[:, :, :views] for key, value in each.items()}, noise=noises)
 

@@ -124,9 +124,7 @@ def view_rows(networks, folder, kind):
         scale = K[0, 0] / (points[0] @ transform[2, :3] + transform[2, 3])
         seen = person.visibility > CLEAR
         yield {
-            name: (changes[i] / scale[i], errors[i] / scale[i])
-            for i, name in enumerate(kind.names)
-            if seen[i] and model.known[i]
+            name: (changes[i] / scale[i], errors[i] / scale[i]) for i, name in enumerate(kind.names) if seen[i] and model.known[i]
         }
 
 
@@ -425,9 +423,7 @@ def fit_refinement(
             pair(row, "aligned", "_mm"),
         ]
         table.append([case, *cells, pair(row, "focal", "_percent"), f"{row['seconds']:.0f}"])
-    halved = lambda case, name: sum(
-        row[case][f"{name}_after_mm"] < 0.5 * row[case][f"{name}_before_mm"] for row in rows
-    )
+    halved = lambda case, name: sum(row[case][f"{name}_after_mm"] < 0.5 * row[case][f"{name}_before_mm"] for row in rows)
     lines = [f"{case}: {halved(case, 'joints')}, {halved(case, 'aligned')} aligned" for case in mean]
     header = ("refined by", "IoU with the masks", "with the true body", "joints, mm", "aligned, mm", "focal, %", "s")
     run.show(

@@ -63,9 +63,7 @@ def fit_scans(
     }
     settings = {"split": split, "noise_mm": noise_mm, "joints": not without_joints}
     rows = run.rows(cases, settings)
-    numbers: dict[str, Any] = {
-        kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds
-    }
+    numbers: dict[str, Any] = {kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds}
     run.show(scans_table(numbers, noise_mm, without_joints), numbers | {"settings": settings})
 
 

@@ -148,9 +148,7 @@ INSIDE = 0.6
 AT_ONCE = 64
 
 
-def winding_numbers(
-    points: Float[Array, "q 3"], vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]
-) -> Float[Array, " q"]:
+def winding_numbers(points: Float[Array, "q 3"], vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, " q"]:
     """How often the mesh winds around each point (q, 3): sum of the signed solid angles of its faces over 4 pi."""
     corners = vertices[faces]
     dot = lambda x, y: jnp.sum(x * y, axis=-1)

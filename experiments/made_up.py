@@ -160,9 +160,7 @@ def write_fit(folder: Path, values: dict[str, Any], mesh: np.ndarray, faces: np.
     (folder / "mesh_smplx.obj").write_text("\n".join(lines) + "\n")
 
 
-def write_scan(
-    folder: Path, name: str, points: np.ndarray, uvs: np.ndarray, faces: np.ndarray, texture: np.ndarray
-) -> None:
+def write_scan(folder: Path, name: str, points: np.ndarray, uvs: np.ndarray, faces: np.ndarray, texture: np.ndarray) -> None:
     """NAME.obj, material0.mtl and material0.jpeg."""
     folder.mkdir(parents=True)
     lines = ["mtllib material0.mtl"]
@@ -206,9 +204,7 @@ class Video:
         known = BodyParameters(shape, rotations, translations)
         self.parameters = turned(known, world, arrays["J_regressor"][0] @ rest)
         number = lambda x: np.asarray(x, np.float32)
-        self.posed = [
-            pose_subject(people[0], number(r), number(t)) for r, t in zip(rotations, translations, strict=True)
-        ]
+        self.posed = [pose_subject(people[0], number(r), number(t)) for r, t in zip(rotations, translations, strict=True)]
         self.cameras = self._around(cameras, size)
         poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in self.cameras])
         poses = poses @ np.linalg.inv(world)
@@ -221,9 +217,7 @@ class Video:
         width, height = size
         reach = 1.3 * float(np.linalg.norm(high - low))
         azimuths = jnp.asarray(np.arange(count) * 2 * np.pi / count, jnp.float32)
-        return list(
-            orbit(jnp.asarray((low + high) / 2), reach, azimuths, 0.1, intrinsics_from_fov(0.7, *size), width, height)
-        )
+        return list(orbit(jnp.asarray((low + high) / 2), reach, azimuths, 0.1, intrinsics_from_fov(0.7, *size), width, height))
 
     def write(self, place: Callable[[int, int], tuple[Path, ...]], background: float = BACKGROUND):
         """Photos and masks at place(camera, frame)."""

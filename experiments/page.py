@@ -151,7 +151,5 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
     browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")
     browser.resize(1280, 800)
     pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
-    camera = Camera.from_opencv(
-        np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]
-    )
+    camera = Camera.from_opencv(np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"])
     return compare(image, avatar, camera, pose)

@@ -77,9 +77,7 @@ def evaluation_views(
     start, views = people.start(), tuple(sorted(set(views)))
     if any(count < 1 or RING % count for count in views):
         raise ValueError(f"--views: expected numbers that divide {RING}, got {views}")
-    subject = functools.lru_cache(1)(
-        lambda seed: make_evaluation_subject(seed, start.body, views, start.size, start.held_out)
-    )
+    subject = functools.lru_cache(1)(lambda seed: make_evaluation_subject(seed, start.body, views, start.size, start.held_out))
 
     def measure(seed, count):
         drawn, truth = draw_person(start.variables, start.config, subject(seed), count), subject(seed).held_out
@@ -138,9 +136,7 @@ def extremes(rows: dict[int, Any]) -> tuple[list[int], list[int]]:
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
     """Whether more photos are ever worse, and how many people beat their vertex-color baseline."""
     mean = [(n, float(np.mean([row[task]["psnr"] for row in rows.values()]))) for n, rows in by_views.items()]
-    worse = [
-        f"by {x - y:.2f} dB from {few} to {many} photos" for (few, x), (many, y) in itertools.pairwise(mean) if y < x
-    ]
+    worse = [f"by {x - y:.2f} dB from {few} to {many} photos" for (few, x), (many, y) in itertools.pairwise(mean) if y < x]
     said = "on average, PSNR falls " + ", ".join(worse) if worse else "more photos are never worse on average"
     rows = [row[task] for row in by_views[chosen].values()]
     whole, person = (sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg"))

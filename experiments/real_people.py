@@ -67,9 +67,7 @@ def without_calibration(
     points = frame.keypoints.points * back[:, None, [0, 1], [0, 1]] + back[:, None, :2, 2]
     focal = np.full(len(points), np.nan) if focal is None else focal
     found = cameras_from_person(
-        PersonViews(
-            points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), focal, frame.names
-        )
+        PersonViews(points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), focal, frame.names)
     )
     cameras = [
         Camera.from_opencv(crop @ np.asarray(own.K, float), own.cam_from_world, SIZE, SIZE)
@@ -194,9 +192,7 @@ def draw_sheet(avatar: Avatar, body: Capture, path: Path) -> None:
     Image.fromarray(sheet).save(path, quality=90)
 
 
-STD = StateStd(
-    focal=0.005, camera_rotation=1.5, camera_center=0.03, body_pose=10.0, global_orient=6.0, betas=1.0, clothing=0.001
-)
+STD = StateStd(focal=0.005, camera_rotation=1.5, camera_center=0.03, body_pose=10.0, global_orient=6.0, betas=1.0, clothing=0.001)
 CONFIG = CaptureRefineConfig(std=STD, coefficients=22, robust_scales=(1.0, 1.0), independent=100.0)
 """A body that fills the masks: for cameras, not for avatars."""
 TIMES = 4

@@ -82,9 +82,7 @@ def refinement(
     cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
     rows = list(run.rows(cases, settings, again=bool(sheet or details_sheet)).values())
     numbers = refinement_means(rows)
-    run.show(
-        refinement_section(numbers, settings, len(rows)), {"settings": settings, "means": numbers, "people": len(rows)}
-    )
+    run.show(refinement_section(numbers, settings, len(rows)), {"settings": settings, "means": numbers, "people": len(rows)})
     if sheet:
         write_triples(sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in run.pictures.items()})
     if details_sheet:
@@ -98,9 +96,7 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
     if not millimetres:
         return subject
     rng, poses = np.random.default_rng(subject.seed), subject.photos.poses
-    off = lambda array, std: jnp.asarray(
-        np.asarray(array) + millimetres * std * rng.normal(size=array.shape), jnp.float32
-    )
+    off = lambda array, std: jnp.asarray(np.asarray(array) + millimetres * std * rng.normal(size=array.shape), jnp.float32)
     rotations = off(poses.rotations[:1], np.radians(DEGREES))
     poses = replace(poses, rotations=rotations, translation=off(poses.translation[:1], 1e-3))
     betas = off(np.asarray(subject.photos.betas), SHAPES)
@@ -142,12 +138,8 @@ def refinement_means(rows: list[Any]) -> dict[str, Any]:
     for name, lengths in rows[0].items():
         found[name] = {}
         for seconds in lengths:
-            tasks = means(
-                [{task: row[name][seconds][task] for task in TASKS if task in lengths[seconds]} for row in rows]
-            )
-            gain = lambda row, name=name, seconds=seconds: (
-                row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
-            )
+            tasks = means([{task: row[name][seconds][task] for task in TASKS if task in lengths[seconds]} for row in rows])
+            gain = lambda row, name=name, seconds=seconds: row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
             found[name][seconds] = tasks | {"least_gain": min(map(gain, rows))}
     return found
 
@@ -164,8 +156,7 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
                 least = f"{cell['least_gain']:.2f}" if task == "novel" and seconds != "0" else ""
                 rows.append([f"{count} of {size} px", start, seconds, TASKS[task], *scores, least])
     about = (
-        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; "
-        "worst-subject gain: the least of any person."
+        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; worst-subject gain: the least of any person."
     )
     true = {
         name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
@@ -186,9 +177,7 @@ def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
                 for task, style in zip(TASKS, ("o-", "s--"), strict=True):
                     values = [cell[task][key] for cell in lengths.values() if task in cell]
                     label = f"{count} photos of {size} px, {start}: {TASKS[task]}"
-                    axis.plot(
-                        [float(x) for x in lengths][: len(values)], values, style, ms=4, color=f"C{i}", label=label
-                    )
+                    axis.plot([float(x) for x in lengths][: len(values)], values, style, ms=4, color=f"C{i}", label=label)
             axis.set(xlabel="seconds", ylabel="PSNR, dB", title=title)
             axis.set_xscale("symlog", linthresh=1)
 
@@ -222,9 +211,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
     Raises: ValueError if the demo was not refined, or the people or the weights of the two tables are not the same.
     """
     if "refined" not in demo:
-        raise ValueError(
-            "the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0"
-        )
+        raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0")
     count = people["people"]
     if refined["people"] != count:
         raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
@@ -238,9 +225,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         "512 px, refined for 1 s": by_size["512"]["1"]["novel"],
         "512 px, refined for 1 s, in poses that no photo shows": by_size["512"]["1"]["animation"],
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
-        "vertex-color baseline, 256 px": {
-            name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "ssim", "psnr_fg")
-        },
+        "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "ssim", "psnr_fg")},
     }
     columns = {"psnr": 1, "ssim": 3, "psnr_fg": 1}
     shown = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]

@@ -36,9 +36,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
         faults += [f"{page.name}: no docs/results/{name}.json for its table" for name in names if name not in known]
-        faults += [
-            f"{page.name}: a table marker without its end" for _ in range(old.count("<!-- table: ") - len(names))
-        ]
+        faults += [f"{page.name}: a table marker without its end" for _ in range(old.count("<!-- table: ") - len(names))]
         shown.update(names)
         new = rendered(old, results, [name for name in names if name in known])
         new = FORMATS.sub(lambda match: match["name"] + match[2] + format_table(match["name"]), new)
@@ -75,9 +73,7 @@ def format_table(name: str) -> str:
             (
                 about,
                 quoted(each.keys),
-                each.up
-                if each.fixed or not each.also
-                else f"{each.up}, or {', '.join(each.also)} where people stand so",
+                each.up if each.fixed or not each.also else f"{each.up}, or {', '.join(each.also)} where people stand so",
                 "must be given" if each.fps is None else f"{each.fps:g}",
             )
             for about, each in arrays

@@ -167,10 +167,7 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
     "noise": (
         "standard deviation",
         0,
-        {
-            x: changes.photos(lambda image, x=x: image + x * changes.noise(4, image.shape))
-            for x in (0.05, 0.1, 0.2, 0.4)
-        },
+        {x: changes.photos(lambda image, x=x: image + x * changes.noise(4, image.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
     ),
     "distance of the cameras": (
         "m",
@@ -188,19 +185,14 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
     "joints turned": (
         "degrees",
         0,
-        {
-            x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * changes.noise(5, r.shape))
-            for x in (1, 2, 4, 8, 16)
-        },
+        {x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * changes.noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
     ),
     "body moved": ("cm", 0, {x: changes.moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
     "shape coefficients": (
         "standard deviations",
         0,
         {
-            x: lambda c, x=x: dataclasses.replace(
-                c, betas=np.asarray(c.betas) + np.float32(x * changes.noise(6, c.betas.shape))
-            )
+            x: lambda c, x=x: dataclasses.replace(c, betas=np.asarray(c.betas) + np.float32(x * changes.noise(6, c.betas.shape)))
             for x in (0.25, 0.5, 1, 2)
         },
     ),
@@ -334,9 +326,7 @@ def relative_error(value, truth):
 def shipped_case(seed):
     """Variables, configuration, body and example of a person of the validation seeds."""
     body, (variables, config) = load_body(), load_weights()
-    person = make_evaluation_subject(
-        seeds_of("validation", seed, 1)[0], body, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0)
-    )
+    person = make_evaluation_subject(seeds_of("validation", seed, 1)[0], body, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
     return variables, config, body, person.inputs(changes.VIEWS), person.held_out
 
 
@@ -353,13 +343,10 @@ def observe(case, name):
         if name == "float16":
             model = config.with_runtime(dtype="float16", scan=False)
             stages = {
-                stage: {"values": values}
-                for stage, values in observer(model, run)(*learned, cast(body), cast(example)).items()
+                stage: {"values": values} for stage, values in observer(model, run)(*learned, cast(body), cast(example)).items()
             }
         else:
-            run = dataclasses.replace(
-                run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32")
-            )
+            run = dataclasses.replace(run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32"))
             _, found = observe_subject(*learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS)
             stages = {x.name: {"values": x.values, "cotangents": x.taken, "gradients": x.gradients} for x in found}
         return jax.tree.map(lambda x: np.asarray(x, np.float64), jax.device_get(stages))

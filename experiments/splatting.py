@@ -246,9 +246,7 @@ def splatting_tradeoff(
     else:
         scene = demo_scene(size)
         start = functools.cache(lambda: (exact_outputs(scene), compiled(scene, DEFAULT_CONFIG)[0]))
-        cases = {
-            each.label: functools.partial(measure, scene, start, each, repeats) for each in settings_of(scene, only)
-        }
+        cases = {each.label: functools.partial(measure, scene, start, each, repeats) for each in settings_of(scene, only)}
         rows = run.rows({"exact": lambda: measure_exact(*start(), repeats)} | cases, {"size": size, "repeats": repeats})
         result = {"size": size, "gaussians": len(scene.gaussians.means), "settings": list(rows.values())}
         run.show(knobs_table(result), result)

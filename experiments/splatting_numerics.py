@@ -308,13 +308,9 @@ def _cases() -> list[Case]:
         Case("far away", "camera and scene 1e5 m from the origin", one(far_from_origin, 1e5), *FARTHER),
         Case("crowds", "2,000 opaque on a pixel", one(crowd, 2_000, (0.5, 1.0), 0.5)),
         Case("crowds", "2,000 faint on a pixel", one(crowd, 2_000, (0.004, 0.006), 0.5)),
-        Case(
-            "crowds", "50,000 opaque on a pixel", one(crowd, 50_000, (0.5, 1.0), 0.5), IMAGE, CROWD_GRADIENT, slow=True
-        ),
+        Case("crowds", "50,000 opaque on a pixel", one(crowd, 50_000, (0.5, 1.0), 0.5), IMAGE, CROWD_GRADIENT, slow=True),
         Case("crowds", "50,000 faint on a pixel", one(crowd, 50_000, (0.004, 0.006), 0.5), slow=True),
-        Case(
-            "crowds", "50,000 at the threshold, none ends the list", one(crowd, 50_000, (0.004, 0.0042), 8.0), slow=True
-        ),
+        Case("crowds", "50,000 at the threshold, none ends the list", one(crowd, 50_000, (0.004, 0.0042), 8.0), slow=True),
         Case("images", "one Gaussian over everything, 31 invisible", over_everything),
         Case("images", "one Gaussian over everything", one(over_everything, 1), slow=True),
         Case("images", "no Gaussians", one(ordinary, 0, 0), drawn=False),
@@ -327,9 +323,7 @@ def _cases() -> list[Case]:
         *(Case("focal length", f"{f:.0e} px", one(seen_through, f, False)) for f in (1, 1e2, 1e4, 1e6)),
         *(Case("focal length", f"{f:.0e} px, zoomed", one(seen_through, f, True)) for f in (1, 1e2, 1e4, 1e6)),
         Case("dtypes", "bfloat16 Gaussians", one(narrow, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True),
-        Case(
-            "dtypes", "bfloat16 everything", one(narrow_everything, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True
-        ),
+        Case("dtypes", "bfloat16 everything", one(narrow_everything, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True),
         Case("dtypes", "float16 Gaussians", one(narrow, np.float16), IMAGE, FLOAT16_GRADIENT, slow=True),
     ]
 
@@ -350,17 +344,13 @@ def evaluate(draw, gaussians, K, pose, background, unit, width, height):
         images = rendering.rgb, rendering.alpha, rendering.depth / unit
         return sum(jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, images, strict=True)), rendering
 
-    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
-        gaussians, K, pose, background
-    )
+    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(gaussians, K, pose, background)
     return rendering, gradients
 
 
 def tiled(scene: Scene):
     """(rendering, gradients) of the renderer, from the scene's own dtypes."""
-    return jax.tree.map(
-        np.asarray, evaluate(render, *scene.arguments(), scene.unit, width=scene.width, height=scene.height)
-    )
+    return jax.tree.map(np.asarray, evaluate(render, *scene.arguments(), scene.unit, width=scene.width, height=scene.height))
 
 
 def tiled_in_float64(scene: Scene):
@@ -449,8 +439,6 @@ def splatting_numerics(run: Run, only: str = "") -> int:
             passes = single.passes(case) and max(double.image, double.gradient) <= FLOAT64
             numbers.append({"case": name, "image_bound": case.image, "gradient_bound": case.gradient, "passes": passes})
             numbers[-1] |= {"float32": dataclasses.asdict(single), "float64": dataclasses.asdict(double)}
-            rows.append(
-                [name + ("" if passes else " **FAILED**"), number(single.image), number(single.gradient), single.worst]
-            )
+            rows.append([name + ("" if passes else " **FAILED**"), number(single.image), number(single.gradient), single.worst])
     run.show(markdown_table(("case", "image error", "gradient error", "of"), rows), numbers)
     return 0 if rows and all(row["passes"] for row in numbers) else 1

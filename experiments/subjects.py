@@ -79,9 +79,7 @@ class People:
     def start(self) -> "Start":
         """Reads what is needed. Raises: ValueError that names the option that is out of range."""
         if min(self.subjects, self.held_out, self.pose_views) < 1 or min(self.first, self.poses) < 0:
-            raise ValueError(
-                "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0"
-            )
+            raise ValueError("--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0")
         backbone = self.lpips_backbone or installed_lpips().get(self.lpips_net)
         lpips = load_loss_networks(None, backbone, self.lpips_heads, self.lpips_net).lpips
         body, (variables, config) = load_body(), load_weights(self.weights)

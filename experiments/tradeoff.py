@@ -226,9 +226,7 @@ class Bench:
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
-        return reconstruct_with(
-            settings.unrefined, self.variables, self.config, self.person(0).inputs(settings.views or 4)
-        )
+        return reconstruct_with(settings.unrefined, self.variables, self.config, self.person(0).inputs(settings.views or 4))
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -286,13 +284,9 @@ class Bench:
         one = held_out.select([0])
         colors = painted_body(photos)
         draw_painted_body(colors, one)
-        makes = [
-            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.iterations)
-        ]
+        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.iterations)]
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         next(usual)
-        frames = [
-            (timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)
-        ]
+        frames = [(timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)]
         make, frame = (np.median(pairs, axis=0) for pairs in (makes, frames))
         return {"reconstruct": float(make[0] / make[1]), "refine_share": 0.0, "frame": float(frame[0] / frame[1])}

@@ -170,9 +170,7 @@ def rows_of(result: dict[str, Any]) -> list[Row]:
     for name, found in result["points"].items():
         row = {"name": name.removeprefix("preset "), **found["what"], **found}
         people = found["people"]  # of docs/results: their number, and means
-        of_people = (
-            {task: found.get(task) for task in TASKS} if isinstance(people, int) else means(people) if people else {}
-        )
+        of_people = {task: found.get(task) for task in TASKS} if isinstance(people, int) else means(people) if people else {}
         row |= {task: of_people.get(task) for task in TASKS}
         rows.append(row)
     return rows
@@ -262,9 +260,7 @@ def scores(row: Row) -> list[str]:
 
 MEASURES = ["reconstruction", "frame", "MiB", "file, MiB", "Gaussians"]
 HEADINGS = [
-    f"{name}: {heading}" if i == 0 else heading
-    for name in TASKS.values()
-    for i, (heading, _) in enumerate(SCORES.values())
+    f"{name}: {heading}" if i == 0 else heading for name in TASKS.values() for i, (heading, _) in enumerate(SCORES.values())
 ]
 
 
@@ -285,10 +281,7 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
         return "no preset has been measured"
     front, best = {row["name"] for row in front_of(rows)}, max(presets, key=quality)
     lost = lambda row: [f"{best[task]['psnr'] - row[task]['psnr']:.2f}" for task in TASKS]
-    table = [
-        [row["name"], *numbers(row), *scores(row), *lost(row), "yes" if row["name"] in front else "no"]
-        for row in presets
-    ]
+    table = [[row["name"], *numbers(row), *scores(row), *lost(row), "yes" if row["name"] in front else "no"] for row in presets]
     header = ["preset", *MEASURES, *HEADINGS, "below best: same pose", "novel poses", "on the front"]
     return f"{about(result)}\n\n{markdown_table(header, table)}"
 

@@ -181,21 +181,15 @@ def compiled(function: Any) -> Any:
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
 
-def run_iterations(
-    variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
-) -> tuple[list[Any], list[Any]]:
+def run_iterations(variables: Any, sample: Sample, photos: int, iterations: int, splat: Any) -> tuple[list[Any], list[Any]]:
     """Parameters side by side after each iteration, and the signals that each iteration saw."""
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(iterations):
         parameters = unstacked(values, sample.start)
-        each = [
-            compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]
-        ]
+        each = [compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]]
         seen.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
-        values, hidden = compiled(refiner_iteration)(
-            variables, values, start, hidden, seen[-1], sample.graph, sample.avatar
-        )
+        values, hidden = compiled(refiner_iteration)(variables, values, start, hidden, seen[-1], sample.graph, sample.avatar)
         after.append(values)
     return after, seen
 
@@ -260,9 +254,7 @@ def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: A
     for i, values in enumerate(after):
         count = 2 if i == iterations - 1 else 1
         each = [
-            view_gradient()(
-                values, sample.start, sample.avatar, sample.views[targets[(i + j) % len(targets)]], splat=splat
-            )[1]
+            view_gradient()(values, sample.start, sample.avatar, sample.views[targets[(i + j) % len(targets)]], splat=splat)[1]
             for j in range(count)
         ]
         cotangents.append(ROUND_WEIGHT ** (iterations - 1 - i) * sum(each) / count)

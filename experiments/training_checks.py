@@ -101,18 +101,14 @@ def runs() -> dict[str, tuple[Any, Any, Any]]:
         """All weights of the loss times a factor."""
 
         def change(config):
-            names = [
-                f.name for f in dataclasses.fields(LossConfig) if f.type is float and f.name != "random_background"
-            ]
+            names = [f.name for f in dataclasses.fields(LossConfig) if f.type is float and f.name != "random_background"]
             weights = {name: factor * getattr(config.loss, name) for name in names}
             return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **weights))
 
         return change
 
     def rate(factor):
-        optimizer = lambda config: dataclasses.replace(
-            config.optimizer, learning_rate=factor * config.optimizer.learning_rate
-        )
+        optimizer = lambda config: dataclasses.replace(config.optimizer, learning_rate=factor * config.optimizer.learning_rate)
         return lambda config: dataclasses.replace(config, optimizer=optimizer(config))
 
     computed = lambda dtype: lambda config: dataclasses.replace(config, model=config.model.with_runtime(dtype=dtype))
@@ -142,9 +138,7 @@ def whitened(inputs: slice, targets: slice) -> Any:
         images[which] = 1.0
         return replace(views, images=images)
 
-    return lambda example: replace(
-        example, inputs=white(example.inputs, inputs), targets=white(example.targets, targets)
-    )
+    return lambda example: replace(example, inputs=white(example.inputs, inputs), targets=white(example.targets, targets))
 
 
 def changed(change: Any = lambda example: example, index: Any = lambda i: i) -> Any:

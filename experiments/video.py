@@ -91,9 +91,7 @@ def write_sheet(path: Path, avatar: Avatar, motion: Motion) -> None:
         posed_before(avatar),
         layered(avatar, motion),
     ]
-    sheet = [
-        tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows
-    ]
+    sheet = [tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows]
     Image.fromarray(to_uint8(np.concatenate(sheet))).save(path, quality=88)
 
 
@@ -154,9 +152,7 @@ def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     view = exr_view("view", avatar, pose, camera, rendering, LAYERS, how)
     seen = view.rgba[..., 3:] > 0
     assert view.depth is not None  # asked for
-    position, normal = (
-        np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1) for name in ("position", "normal")
-    )
+    position, normal = (np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1) for name in ("position", "normal"))
     low, high = (np.asarray([edge(position[..., i][seen[..., 0]]) for i in range(3)]) for edge in (np.min, np.max))
     near, far = view.depth[seen[..., 0]].min(), view.depth[seen[..., 0]].max()
     palette = np.random.default_rng(3).uniform(0.15, 1, (len(avatar.joint_names) + 1, 3))

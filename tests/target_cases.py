@@ -37,10 +37,7 @@ def small(name: str) -> HumanGSConfig:
         config = small_system("lhm_views").with_parts(driver=change(parts.driver, hidden=8, layers=1, joints=2))
     else:
         surface = SurfaceMap(parts.surface_map.kind, TEXELS)
-        moved = {
-            field: change(getattr(parts, field), surface_map=surface)
-            for field in ("reader", "decoder")[name != "giga" :]
-        }
+        moved = {field: change(getattr(parts, field), surface_map=surface) for field in ("reader", "decoder")[name != "giga" :]}
         sizes = {"pose_width": 8, "pose_tokens": 2, "joints": 2} if name == "giga" else {}
         config = config.with_parts(**moved, driver=change(parts.driver, widths=(4, 8), **sizes))
     return config.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)

@@ -112,11 +112,7 @@ def test_fit_deletes_no_folder_with_something_of_its_own_or_of_the_user(capture_
         assert code == 2 and message in error and error.count("\n") == 1, (arguments, error)
     assert sorted(tmp_path.rglob("*")) == before
     code, printed, _ = humangs("fit", "--scan", "none.obj", "--out", "docs", "--overwrite")
-    assert (
-        code == cli.BAD_DATA
-        and "this is deleted: me.obj, scan_fit.json" in printed
-        and sorted(tmp_path.rglob("*")) == before
-    )
+    assert code == cli.BAD_DATA and "this is deleted: me.obj, scan_fit.json" in printed and sorted(tmp_path.rglob("*")) == before
 
 
 def test_the_options_of_each_way_to_fit_exist():

@@ -95,11 +95,7 @@ BAD_DATA = {
 }
 SIZES = {"animate me.npz": "", "render me.npz": "", "demo": " 16 to 8,192", "synth": " 128, 256 or 512"}
 BAD_USAGE = {
-    **{
-        f"{line} --size {n}": f"--size {n}: expected{words}"
-        for line, words in SIZES.items()
-        for n in ("-5", "0", "100000")
-    },
+    **{f"{line} --size {n}": f"--size {n}: expected{words}" for line, words in SIZES.items() for n in ("-5", "0", "100000")},
     "synth --size 100": "--size 100: expected 128, 256 or 512",
     "refine me.npz me --image-size 0": "--image-size 0: expected 16 to 8,192",
     "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
@@ -164,9 +160,7 @@ def test_what_cannot_be_meant_is_one_line_before_the_work(line, expected, said, 
 
 def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, monkeypatch, humangs):
     """The quick part of `check`; here the command ends after it."""
-    monkeypatch.setattr(
-        many, "reconstruct_many", lambda variables, config, captures, batch: iter([captures["turned"]()][1:])
-    )
+    monkeypatch.setattr(many, "reconstruct_many", lambda variables, config, captures, batch: iter([captures["turned"]()][1:]))
     in_degrees = spoil_body(lambda arrays: arrays.update(rotations=np.degrees(arrays["rotations"])))
     turned = spoiled(capture_folder, tmp_path / "turned", in_degrees)
     arguments = ("reconstruct", turned, "--out", tmp_path / "a.npz")

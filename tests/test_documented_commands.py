@@ -323,9 +323,7 @@ def test_blocks_are_whole_and_spans_are_not():
     assert filled(words) == ["import", "cameras", "1", "--scale", "1", "--up=+z", "integer", "1/x.npz"]
 
 
-@pytest.mark.parametrize(
-    "words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos"]
-)
+@pytest.mark.parametrize("words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos"])
 def test_a_wrong_line_is_noticed(words):
     command = Command("page", ("humangs", *words.split()), True)
     assert refused(command) is not None

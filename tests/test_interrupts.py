@@ -126,9 +126,7 @@ def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
         "print('imported', flush=True)\n"
     )
     path = os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])
-    program = process(
-        command("import slow_to_import, time; time.sleep(300)"), environment=ENVIRONMENT | {"PYTHONPATH": path}
-    )
+    program = process(command("import slow_to_import, time; time.sleep(300)"), environment=ENVIRONMENT | {"PYTHONPATH": path})
     out, error = program.communicate(timeout=250)
     assert (program.returncode, out) == (cli.INTERRUPTED, "imported\n"), error
 

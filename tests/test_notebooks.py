@@ -28,9 +28,7 @@ MOST_BYTES = 1_500_000
 
 UNITS = ("dB", "%", "MiB", "MB", "ms", "s", "mm", "m", "times")
 NUMBER = r"\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-STATED = re.compile(
-    rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?", re.I
-)
+STATED = re.compile(rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?", re.I)
 IN_WORDS = re.compile(
     r"\b(halves|thirds|quarters?|fifths|sixths|eighths|tenths|twice|thrice|percent|half (?:of|as)|"
     r"a (?:half|third|fifth|tenth) of|(?:two|three|four|five|six|seven|eight|nine|ten|twenty|hundred|thousand) times)\b",

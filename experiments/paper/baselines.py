@@ -160,9 +160,7 @@ def configuration(steps: int, size: Any) -> Any:
         model=model,
         views=ViewSampling(input_counts=(1,), target_count=3),  # a photo has to be given, and is not looked at
         loss=LossConfig(squared=0.0, absolute=1.0, tightness=0.005),
-        optimizer=OptimizerConfig(
-            learning_rate=5e-4 if size == "published" else 2e-3, warmup_steps=min(50, steps // 4)
-        ),
+        optimizer=OptimizerConfig(learning_rate=5e-4 if size == "published" else 2e-3, warmup_steps=min(50, steps // 4)),
         target_size=model.conventions.image_size,
         steps=steps,
         log_every=min(20, steps),

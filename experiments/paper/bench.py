@@ -203,9 +203,7 @@ def train_variant(
     if int(state.step) < config.steps:
         return None
     variables = jax.device_get(state.variables)
-    by_views = {
-        str(count): score(variables, gaussian_body(body, config.model), config, validation, count) for count in views
-    }
+    by_views = {str(count): score(variables, gaussian_body(body, config.model), config, validation, count) for count in views}
     return {
         "by_views": by_views,
         "photos": config.views.input_counts[0],
@@ -350,9 +348,7 @@ def measured(
         seconds["frame"].append(drawn / case.truth.view_count)
         return predicted
 
-    found = evaluate(
-        people, method=method, inputs=None if indices else photos, indices=indices, lpips=networks, body=body
-    )
+    found = evaluate(people, method=method, inputs=None if indices else photos, indices=indices, lpips=networks, body=body)
     means: dict[str, Any] = {"photos": photos}
     for task, rows in (
         ("reconstruction", [row.scores for row in found.rows if row.frame == 0]),
@@ -394,7 +390,5 @@ def triple(scores: Any) -> str:
     if scores is None:
         return "-"
     values = scores if isinstance(scores, tuple) else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
-    texts = [
-        f"{value:.{digits}f}" if value is not None else "-" for value, digits in zip(values, (2, 3, 3), strict=True)
-    ]
+    texts = [f"{value:.{digits}f}" if value is not None else "-" for value, digits in zip(values, (2, 3, 3), strict=True)]
     return " / ".join(texts)

@@ -107,9 +107,7 @@ def read_release_config(path: Path) -> dict[str, Any]:
     if not isinstance(setting("model"), dict):
         raise ValueError(f"{path}: expected an object with 'model'")
     if setting("training", "use_canonical_maps"):
-        raise ValueError(
-            f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported"
-        )
+        raise ValueError(f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported")
     if setting("training", "target_height") not in (None, 1.8):
         raise ValueError(f"{path}: training.target_height must be 1.8, got {setting('training', 'target_height')!r}")
     names = {
@@ -198,9 +196,7 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     stages = intermediates(variables, inputs, config)
     features, outputs = stages["reader"], stages["decoder"]
     gaussians, maps = outputs.gaussians, stages["encoder"].maps
-    if (
-        encoder.upsampler is not None
-    ):  # vertices read the last convolution only where they need it; here it is everywhere
+    if encoder.upsampler is not None:  # vertices read the last convolution only where they need it; here it is everywhere
         convolution = Convolution(int(reader.output_width or 0), nn.initializers.zeros, config.runtime.compute_dtype)
         maps = convolution.apply(part_variables(variables, "reader"), maps)
     pixels, texture = encoder_pixels(inputs, config.run()), variables["params"]["encoder"]["tokenizer"]["texture"]
@@ -303,8 +299,7 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
             inputs, weights, transforms = subject_inputs(expected, index, working)
             subjects.append(jax.tree.map(np.asarray, compute(variables, inputs, settings, weights, transforms)))
     found = {
-        name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects])
-        for name in subjects[0]
+        name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects]) for name in subjects[0]
     }
     return found, expected
 

@@ -174,9 +174,7 @@ def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str
 
 def patches(mask: np.ndarray, side: int) -> list[tuple[slice, slice]]:
     """Squares more than half of which the mask covers."""
-    corners = [
-        (y, x) for y in range(0, mask.shape[0] - side + 1, side) for x in range(0, mask.shape[1] - side + 1, side)
-    ]
+    corners = [(y, x) for y in range(0, mask.shape[0] - side + 1, side) for x in range(0, mask.shape[1] - side + 1, side)]
     boxes = [(slice(y, y + side), slice(x, x + side)) for y, x in corners]
     return [box for box in boxes if mask[box].mean() > 0.5]
 

@@ -151,9 +151,7 @@ def animation(names: list[str], measure: Measure, arguments: Any) -> str:
         if found is not None:
             rows.append([name, photos_of(found, name, arguments.gray), of(found, "animation"), "", ""])
     text = markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
-    return (
-        f"{text}\n\n{fitted(read_json(arguments.fits)['numbers']['paper_fits'].values())}" if arguments.fits else text
-    )
+    return f"{text}\n\n{fitted(read_json(arguments.fits)['numbers']['paper_fits'].values())}" if arguments.fits else text
 
 
 def fitted(fits: Collection[Mapping[str, Any]]) -> str:
@@ -169,9 +167,7 @@ def reconstruction(names: list[str], measure: Measure, arguments: Any) -> str:
     for name in names:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append(
-                [name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")]
-            )
+            rows.append([name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")])
     return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
 
 
@@ -184,9 +180,7 @@ def domains(names: list[str], measure: Measure, arguments: Any) -> str:
         if found[0] is not None:
             rows.append([name, photos_of(found[0], name, arguments.gray), *(of(x, "reconstruction") for x in found)])
         if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
-            rows.append(
-                [f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]]
-            )
+            rows.append([f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]])
     heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 

@@ -187,8 +187,7 @@ def table(
     if counted:
         counts = sorted({int(count) for own in counted.values() for count in own})
         shown = [
-            [name, *(f"{own[str(c)]['psnr_fg']:.2f}" if str(c) in own else "" for c in counts)]
-            for name, own in counted.items()
+            [name, *(f"{own[str(c)]['psnr_fg']:.2f}" if str(c) in own else "" for c in counts)] for name, own in counted.items()
         ]
         texts.append(markdown_table(["foreground PSNR, dB, by photos", *map(str, counts)], shown))
     return "\n\n".join(texts)

@@ -159,9 +159,7 @@ def lhm_plus(size: Size = "published") -> HumanGSConfig:
 def gst(size: Size = "published") -> HumanGSConfig:
     """GST-style (`grouped`): one photo of 256 pixels; HMR2's ViT-H in size (1280 wide, 32 layers, patches of 16)."""
     if size == "published":
-        encoder = _photo_encoder(
-            TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16
-        )
+        encoder = _photo_encoder(TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16)
         conventions = Conventions(image_size=256, body_vertices=6890)  # those of SMPL
         return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder()), conventions)
     config = lhm("bench")

@@ -82,9 +82,7 @@ class CrossBlock(nn.Module):
     runtime: Runtime
 
     @nn.compact
-    def __call__(
-        self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
-    ) -> Float[Array, "n d"]:
+    def __call__(self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None) -> Float[Array, "n d"]:
         width, dtype = x.shape[-1], self.runtime.compute_dtype
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
         heads = lambda y: y.reshape(len(y), -1, self.head_width)

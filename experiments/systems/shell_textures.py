@@ -134,9 +134,7 @@ def _filled(sums, weights):
     _, height, width, _ = sums.shape
     if height % 2 or width % 2:
         total = jnp.sum(weights, axis=(1, 2), keepdims=True)
-        coarse = jnp.where(
-            total > 0, jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1), UNSEEN_COLOR
-        )
+        coarse = jnp.where(total > 0, jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1), UNSEEN_COLOR)
     else:
         coarse = doubled(_filled(halved(sums), halved(weights)))
     return jnp.where(weights > 0, mean, coarse)

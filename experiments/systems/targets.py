@@ -137,9 +137,7 @@ class PixelDriver(Driver):
     ) -> tuple[Float[np.ndarray, "v h w 3"], None]:
         """See `parts.Driver`. Raises: ValueError for another background than white."""
         if background != 1:
-            raise ValueError(
-                f"a network that draws pixels shows people on white; background {background:g} was asked for"
-            )
+            raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
         outputs, body, views, config = _reconstructed(variables, config, inputs)
         own, images = part_variables(variables, "driver"), []
         for pose, camera in zip(_poses(targets), targets.cameras, strict=True):

@@ -100,9 +100,7 @@ class CheckReport:
             rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warnings))])
         lines = text_table(rows)
         if self.displaced:
-            lines.append(
-                f"reconstruct will move the body to the masks, by up to {100 * self.displaced:.1f} cm (yellow)"
-            )
+            lines.append(f"reconstruct will move the body to the masks, by up to {100 * self.displaced:.1f} cm (yellow)")
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
@@ -161,9 +159,7 @@ def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.nda
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
     """Colors of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
     weights = np.asarray(body.skinning_weights)
-    left, right = (
-        weights @ np.array([name.startswith(side) for name in body.joint_names]) for side in ("left", "right")
-    )
+    left, right = (weights @ np.array([name.startswith(side) for name in body.joint_names]) for side in ("left", "right"))
     if not (left.any() and right.any()):
         left, right = (np.asarray(body.template)[:, 0] * sign > 0 for sign in (1, -1))
     left, right = left.astype(np.float32)[:, None], right.astype(np.float32)[:, None]
@@ -173,9 +169,7 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 
 @jax.jit
-def _body_image(
-    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], tints: Float[Array, "n 3"], camera: Camera
-) -> BodyImage:
+def _body_image(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], tints: Float[Array, "n 3"], camera: Camera) -> BodyImage:
     points = transform.apply(camera.cam_from_world, vertices)
     rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
     rotation = camera.cam_from_world[:3, :3]
@@ -198,9 +192,7 @@ def _posed_frames(capture: Capture, moves: Float[np.ndarray, "n 3"] | None = Non
 def _agreement(covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
     """Intersection over union of body and mask, and the share of the body more than one pixel off the mask."""
     union = max((covered | mask).sum(), 1)
-    return float((covered & mask).sum() / union), float(
-        (covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1)
-    )
+    return float((covered & mask).sum() / union), float((covered & ~binary_dilation(mask)).sum() / max(covered.sum(), 1))
 
 
 def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -311,9 +303,7 @@ def _with_keypoints(
 
 
 def _is_small(name: str) -> bool:
-    return name.startswith("face_") or any(
-        part in name for part in ("hand_root", *(f"_{finger}_" for finger in FINGERS))
-    )
+    return name.startswith("face_") or any(part in name for part in ("hand_root", *(f"_{finger}_" for finger in FINGERS)))
 
 
 def _color(name: str) -> tuple[int, ...]:

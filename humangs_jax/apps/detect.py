@@ -93,9 +93,7 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     """The same for the photos of a capture folder; their names are the views'. Raises: see `found_in_photos`."""
     photos = load_photos(folder)  # checked; these are on white where there are masks
     views = read_description(folder / "capture.json")["views"]
-    found = detect_photos(
-        [f"{name}.png" for name in photos.names], (read_image(folder / view["image"])[0] for view in views)
-    )
+    found = detect_photos([f"{name}.png" for name in photos.names], (read_image(folder / view["image"])[0] for view in views))
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
@@ -171,8 +169,7 @@ def same_people(
         rows = [list(photo.people) for photo in photos]
     most = max((len(row) for row in rows), default=0)
     ordered = [
-        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row))))
-        for photo, row in zip(photos, rows, strict=True)
+        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row)))) for photo, row in zip(photos, rows, strict=True)
     ]
     order = np.argsort([-area for area in _areas(ordered)], kind="stable")
     return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
@@ -268,9 +265,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
         rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
         if rivals:
             where = few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
-            raise ValueError(
-                f"{len(rivals) + 1} people in {where}: expected one. Person 0 to {len(rivals)}: numbers on {sheet}"
-            )
+            raise ValueError(f"{len(rivals) + 1} people in {where}: expected one. Person 0 to {len(rivals)}: numbers on {sheet}")
     if unclear := [photo.name for photo in photos if photo.unclear]:
         raise ValueError(
             f"{few(unclear)}: which of the people of {sheet} is meant? Their colors do not tell: cut these photos down to "
@@ -296,15 +291,10 @@ def person_of(photos: Sequence[PhotoPeople], keypoints: Keypoints, folder: Path)
     return _best(photos, inside, "keypoints", folder)
 
 
-def _best(
-    photos: Sequence[PhotoPeople], agreement: Callable[[int, np.ndarray], float], given: str, folder: Path
-) -> int:
+def _best(photos: Sequence[PhotoPeople], agreement: Callable[[int, np.ndarray], float], given: str, folder: Path) -> int:
     """The person with the most agreement over all photos."""
     count = len(photos[0].people)
-    sums = [
-        sum(agreement(v, person_mask(p, i)) for v, p in enumerate(photos) if p.people[i] is not None)
-        for i in range(count)
-    ]
+    sums = [sum(agreement(v, person_mask(p, i)) for v, p in enumerate(photos) if p.people[i] is not None) for i in range(count)]
     if max(sums, default=0.0) <= 0:
         write_sheet(folder / SHEET_FILE, photos)
         raise ValueError(f"the {given} are of nobody who was found in the photos: see {folder / SHEET_FILE}")
@@ -320,9 +310,7 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     """What should be known about the photos of a person, a line each."""
     told = [f"{name}: the person was not found in it" for name in absent(photos, person)]
     if any(photo.colors for photo in photos):
-        told.insert(
-            0, f"several people in a photo: number {person} is the same by the colors of upper body and legs alone"
-        )
+        told.insert(0, f"several people in a photo: number {person} is the same by the colors of upper body and legs alone")
     found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
     for photo, each in found:
         points = each.person.points[:, :2]
@@ -419,8 +407,7 @@ def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = 
     pictures = [_picture(photo, person) for photo in photos]
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     padded = [
-        np.pad(each, ((0, height - each.shape[0]), (0, width - each.shape[1]), (0, 0)), constant_values=1.0)
-        for each in pictures
+        np.pad(each, ((0, height - each.shape[0]), (0, width - each.shape[1]), (0, 0)), constant_values=1.0) for each in pictures
     ]
     contact_sheet(np.stack(padded), path, labels=[photo.name for photo in photos])
 

@@ -119,8 +119,7 @@ def _written(
     calibration = _calibration(seen, found, images)
     report = import_calibration(calibration, images, out, masks=masks)
     used = [
-        _repaired(photos[shown[view]], number, bool(mirrored))
-        for view, mirrored in zip(found.views, found.mirrored, strict=True)
+        _repaired(photos[shown[view]], number, bool(mirrored)) for view, mirrored in zip(found.views, found.mirrored, strict=True)
     ]
     views = read_description(out / "capture.json")["views"]
     size = (report.width, report.height)

@@ -210,9 +210,7 @@ def _cause(views: _Views, i: int, body: Cells, mask: Cells | None) -> str | None
 # Coarse silhouettes ---------------------------------------------------------------------------------------------------
 
 
-def _silhouette(
-    views: _Views, i: int, matrix: Matrix | None = None, camera: int | None = None
-) -> tuple[Cells, float, float]:
+def _silhouette(views: _Views, i: int, matrix: Matrix | None = None, camera: int | None = None) -> tuple[Cells, float, float]:
     """The cells that the body of view i covers; the share of its points in the image; and its height there, of the image's.
 
     Arguments: matrix: in place of its camera's. camera: of another view.

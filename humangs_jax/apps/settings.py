@@ -68,13 +68,9 @@ class Settings:
 
     views: Few | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
-    refine_iterations: Iterations = knob(
-        0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
-    )
+    refine_iterations: Iterations = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
     refine_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
-    head_steps: RefineSteps = knob(
-        0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
-    )
+    head_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md")
     refine_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
@@ -126,9 +122,7 @@ PRESETS: Presets[Settings] = Presets(
             refine_size=256,
             splat="near_exact",
         ),
-        "quality": Settings(
-            views=4, runtime=Runtime(crop=True), refine_iterations=4, refine_size=512, splat="near_exact"
-        ),
+        "quality": Settings(views=4, runtime=Runtime(crop=True), refine_iterations=4, refine_size=512, splat="near_exact"),
         "best": Settings(runtime=Runtime(crop=True), refine_iterations=4, refine_steps=100, refine_size=512),
     },
     "; those of training are in humangs_jax.training.config",
@@ -235,9 +229,7 @@ class Cost:
 
     def worst(self, other: "Cost") -> "Cost":
         """The larger one of each."""
-        memory = (
-            None if None in (self.memory_mb, other.memory_mb) else max(self.memory_mb or 0.0, other.memory_mb or 0.0)
-        )
+        memory = None if None in (self.memory_mb, other.memory_mb) else max(self.memory_mb or 0.0, other.memory_mb or 0.0)
         make, refine = max(self.make_ms, other.make_ms), max(self.refine_ms, other.refine_ms)
         return Cost(make, refine, max(self.frame_ms, other.frame_ms), memory)
 
@@ -302,9 +294,7 @@ def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[st
         ratio, found = min(pairs, key=lambda pair: abs(math.log(pair[0] / wanted)))
         return found * wanted / ratio
 
-    memory = (
-        None if any(cost.memory_mb is None for _, cost in known) else part("memory_mb", lambda c: c.memory_mb or 0.0)
-    )
+    memory = None if any(cost.memory_mb is None for _, cost in known) else part("memory_mb", lambda c: c.memory_mb or 0.0)
     return Cost(
         part("make", lambda c: c.make_ms),
         part("refine", lambda c: c.refine_ms),
@@ -420,9 +410,7 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
     steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few, head_steps=0).refinement
     if steps is not None:
         steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
-    return [
-        (c, times) for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None
-    ]
+    return [(c, times) for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None]
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int) -> Iterator[Rendering]:
@@ -454,17 +442,13 @@ def in_words(tuned: Tuned, best: FrontPoint) -> str:
     parts = ["all photos" if views is None else f"{views} photo{'s' * (views > 1)}"]
     parts += [f"of {size} pixels"] if size else []
     parts += ["cut to the person"] if settings.runtime.crop else []
-    refined = [
-        f"{n} {name}" for n, name in ((settings.refine_iterations, "iterations"), (settings.refine_steps, "steps")) if n
-    ]
+    refined = [f"{n} {name}" for n, name in ((settings.refine_iterations, "iterations"), (settings.refine_steps, "steps")) if n]
     parts += [f"{' and '.join(refined)} of refinement" if refined else "no refinement"]
     parts += [f"drawn {settings.splat}"]
     takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
     takes += "" if cost.memory_mb is None else f", {cost.memory_mb:.0f} MiB"
     lost = best.psnr - point.psnr, best.psnr_poses - point.psnr_poses
-    gives = (
-        f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against {best.name!r}"
-    )
+    gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against {best.name!r}"
     gives = "is the best of all settings" if point.name == best.name else gives
     return f"{point.name}: {', '.join(parts)}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 

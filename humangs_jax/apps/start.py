@@ -90,9 +90,7 @@ class Missing:
         return "\n".join([f"{self.name}: {self.why}", *(f"    {line}" for line in self.how)])
 
 
-def look(
-    folder: Path, *, cameras: Path | None = None, masks: Path | None = None, keypoints: Path | None = None
-) -> Material:
+def look(folder: Path, *, cameras: Path | None = None, masks: Path | None = None, keypoints: Path | None = None) -> Material:
     """What a folder has; what the arguments name is taken from there.
 
     Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a named file does not exist.
@@ -125,9 +123,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     images = next((place for name in PHOTO_FOLDERS if any(find_photos(place := folder / name))), folder)
     photos = sorted(find_photos(images))
     if not photos:
-        raise CaptureError(
-            folder, "", f"no photo: expected {', '.join(SUFFIXES[:4])} files in it or in {folder / 'images'}"
-        )
+        raise CaptureError(folder, "", f"no photo: expected {', '.join(SUFFIXES[:4])} files in it or in {folder / 'images'}")
     return images, photos
 
 
@@ -297,9 +293,7 @@ class HeldOut(NamedTuple):
         return f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the foreground"
 
 
-def held_out_psnr(
-    variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
-) -> HeldOut | None:
+def held_out_psnr(variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None) -> HeldOut | None:
     """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
     `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
     second copy of the nearest photo: the programs for that number of photos are compiled already.

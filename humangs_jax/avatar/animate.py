@@ -67,9 +67,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     joints = len(avatar.parents)
     if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):
         found = f"rotations {pose.rotations.shape}, translation {pose.translation.shape}"
-        raise ValueError(
-            f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses"
-        )
+        raise ValueError(f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses")
     moves = {
         "pose.rotations": (pose.rotations, FINITE),
         "pose.translation": (pose.translation, FINITE),

@@ -152,9 +152,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     check_joints(header["parents"], header["joint_names"])
     skinning, rendering = header["skinning"], header.get("rendering", "exact")  # the first files do not say
     if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
-        raise Refused(
-            f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
-        )
+        raise Refused(f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'")
     arrays = {name: arrays[name] for name in wanted}
     _check_arrays(arrays, len(header["parents"]))
     check_checksum(header.get("checksum"), checksum(arrays))

@@ -202,9 +202,7 @@ def _paths(means: Array, weights: Array, rest_joints: Array, parents: tuple[int,
 # Sequences ---------------------------------------------------------------------------------------------------------------
 
 
-def excerpt(
-    motion: Motion, start: float = 0.0, stop: float | None = None, fps: float | None = None, loop: int = 1
-) -> Motion:
+def excerpt(motion: Motion, start: float = 0.0, stop: float | None = None, fps: float | None = None, loop: int = 1) -> Motion:
     """A motion from `start` to `stop` (seconds), at another frame rate, `loop` times.
 
     Every repetition starts where the one before has ended, at the same height. Raises: ValueError naming what is out of range.
@@ -213,9 +211,7 @@ def excerpt(
     length = count / motion.fps
     stop = length if stop is None else stop
     if not 0 <= start < stop <= length + 0.5 / motion.fps:
-        raise ArgumentError(
-            "start", f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds"
-        )
+        raise ArgumentError("start", f"{start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds")
     if loop < 1:
         raise ArgumentError("loop", f"{loop}: expected at least 1")
     rate = motion.fps if fps is None else fps
@@ -234,9 +230,7 @@ def excerpt(
     return replace(part, rotations=turned, translations=jnp.asarray(moved, jnp.float32))
 
 
-def motion_views(
-    avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True
-) -> tuple[BodyPose, Camera]:
+def motion_views(avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True) -> tuple[BodyPose, Camera]:
     """A pose and a camera for each frame of a motion, which is put on the floor.
 
     Arguments: turn: degrees that the camera travels around the person. follow: the camera goes along with the person; else it
@@ -251,9 +245,7 @@ def motion_views(
     count = len(motion.translations)
     poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)
     azimuths = turn * np.arange(count) / count
-    return poses, shot_cameras(
-        shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None
-    )
+    return poses, shot_cameras(shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None)
 
 
 def turntable_views(avatar: Avatar, pose: BodyPose, views: int, shot: Shot) -> tuple[BodyPose, Camera]:

@@ -165,9 +165,7 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
     return points.astype(np.float32)
 
 
-def splatted(
-    gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Float[Array, "g c"]
-) -> Float[np.ndarray, "h w c"]:
+def splatted(gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Float[Array, "g c"]) -> Float[np.ndarray, "h w c"]:
     """Any numbers of Gaussians summed by the weights of their colors: splatting draws three channels at a time."""
     count = values.shape[1]
     triples = jnp.pad(values, ((0, 0), (0, -count % 3))).reshape(len(values), -1, 3)

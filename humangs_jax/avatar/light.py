@@ -109,9 +109,7 @@ def light_coefficients(
     return jax.lax.fori_loop(0, ITERATIONS, step, jnp.zeros(TERMS))
 
 
-def surface_normals(
-    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], points: Float[Array, "g 3"]
-) -> Float[Array, "g 3"]:
+def surface_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], points: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
     """Unit normals of a mesh at the vertex nearest to each point. On the host."""
     from scipy.spatial import KDTree
 

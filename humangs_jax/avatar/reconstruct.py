@@ -207,9 +207,7 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
             raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
         _check(capture, f"captures[{index}]")
         if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
-            raise ValueError(
-                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
-            )
+            raise ValueError(f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model")
     body = gaussian_body(captures[0].body, config)
     bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
     coefficients = max(len(capture.betas) for capture in captures)
@@ -285,9 +283,7 @@ def reconstruct_views(
 
 
 @jax.jit
-def _reconstruct(
-    variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
-) -> tuple[Avatar, Int[Array, ""]]:
+def _reconstruct(variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews) -> tuple[Avatar, Int[Array, ""]]:
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 
 
@@ -316,9 +312,7 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
     """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
     conventions, avatar = config.conventions, make_avatar(outputs, body, subject_rest(body, views), config)
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
-        avatar = with_spread_weights(
-            avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach
-        )
+        avatar = with_spread_weights(avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach)
     if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
     if conventions.low_pass is not None:
@@ -365,9 +359,7 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     volumes = jnp.sum(columns[0] * crossed[:, 0], axis=-1)
     safe = volumes > SMALLEST_VOLUME
     moved = transform.apply(before, gaussians.means) - after[:, :3, 3]
-    held = jnp.einsum(
-        "gab,gb->ga", crossed / jnp.where(safe, volumes, 1)[:, None, None], moved, precision=transform.EXACT
-    )
+    held = jnp.einsum("gab,gb->ga", crossed / jnp.where(safe, volumes, 1)[:, None, None], moved, precision=transform.EXACT)
     means = jnp.where(safe[:, None], held, gaussians.means)
     weights = jnp.where(safe[:, None], spread, own)
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)

@@ -87,9 +87,7 @@ def tile(
     top = 0 if headers is None else text + 2 * GAP
     rows = -(-count // columns)
     sheet = np.ones((top + rows * (strip + height + GAP) + GAP, columns * (width + GAP) + GAP, 3))
-    corners = [
-        (top + GAP + (i // columns) * (strip + height + GAP), GAP + (i % columns) * (width + GAP)) for i in range(count)
-    ]
+    corners = [(top + GAP + (i // columns) * (strip + height + GAP), GAP + (i % columns) * (width + GAP)) for i in range(count)]
     for image, (y, x) in zip(images, corners, strict=True):
         sheet[y + strip : y + strip + height, x : x + width] = image
     texts = [(label, x, y, width) for label, (y, x) in zip(labels or (), corners, strict=False)]

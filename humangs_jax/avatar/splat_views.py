@@ -75,9 +75,7 @@ def file_cameras(path: Path, shot: Shot) -> dict[str, Camera]:
     return cameras
 
 
-def splat_images(
-    gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot
-) -> Iterator[Float[np.ndarray, "h w c"]]:
+def splat_images(gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image for each camera, in bounded memory; with alpha where the shot's background is transparent."""
     config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
     for camera in bar(list(cameras.values()), desc="render", unit="view"):

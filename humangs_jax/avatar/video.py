@@ -45,13 +45,9 @@ def check_video(path: str | Path, frames: int, width: int, height: int, transpar
         raise ArgumentError("path", f"{path}: expected a name ending in {alternatives(VIDEOS.suffixes)} for PNG files")
     if transparent and not form.transparent:
         others = alternatives(VIDEOS.where(lambda each: each.transparent).suffixes)
-        raise ArgumentError(
-            "path", f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color"
-        )
+        raise ArgumentError("path", f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color")
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
-        raise ArgumentError(
-            "path", f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm"
-        )
+        raise ArgumentError("path", f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm")
     if suffix and path.is_dir():
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
     if not suffix and path.is_file():
@@ -143,9 +139,7 @@ def write_webm(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tupl
     _write_by_ffmpeg(path, frames, fps, shape, quality)
 
 
-def _write_by_ffmpeg(
-    path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]
-) -> None:
+def _write_by_ffmpeg(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]) -> None:
     """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 

@@ -84,14 +84,10 @@ def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
     """Landmarks that lie where this module has them, as far as fits may find them elsewhere."""
     sides = [name.split("_", 1) if name.startswith(("left_", "right_")) else ("", name) for name in names]
     known = [(name, side, part) for name, (side, part) in zip(names, sides, strict=True) if part in CARRIERS]
-    return tuple(
-        Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part])) for n, side, part in known
-    )
+    return tuple(Place(n, n, (0.0, 0.0, 0.0), tuple(j.format(side=side) for j in CARRIERS[part])) for n, side, part in known)
 
 
-def both_sides(
-    names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
-) -> tuple[Place, Place]:
+def both_sides(names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres) -> tuple[Place, Place]:
     """A landmark of the left side and its mirror image.
 
     Arguments: names: of the left and the right one. base, joints: with {side} for the side. millimetres: the left one's.
@@ -249,9 +245,7 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
     """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
     sources = finder.find(place.base)
-    points = _concatenated(
-        [_surface_points(body, np.asarray([s])) if s >= 0 else _joint_point(body, -1 - s) for s in sources]
-    )
+    points = _concatenated([_surface_points(body, np.asarray([s])) if s >= 0 else _joint_point(body, -1 - s) for s in sources])
     mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), points)
     weights = mean.weights
     if place.joints:
@@ -282,9 +276,7 @@ def pose_joints(
     return transforms, transform.apply(transforms, rest)
 
 
-def landmarks_from(
-    model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
-) -> Float[Array, "k 3"]:
+def landmarks_from(model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]) -> Float[Array, "k 3"]:
     """Landmarks from posed joints and points."""
     return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=EXACT)
 

@@ -293,9 +293,7 @@ def _part(name: str, values: Any, size: int, dtype: Any) -> Float[Array, " size"
     return values.reshape(size)
 
 
-def _hand(
-    side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_hand_mean: bool, dtype: Any
-) -> Float[Array, "45"]:
+def _hand(side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_hand_mean: bool, dtype: Any) -> Float[Array, "45"]:
     """Axis-angle numbers (45,) of one hand."""
     name = ("left_hand_pose", "right_hand_pose")[side]
     if hands is None and not (flat_hand_mean and (values is None or not use_pca)):

@@ -151,9 +151,7 @@ class SurfacePoints:
     weights: Float[Array, "p j"]
 
 
-def shaped(
-    mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]
-) -> Float[Array, "p 3"]:
+def shaped(mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]) -> Float[Array, "p 3"]:
     """Points or joints of a person in T-pose, metres; missing coefficients are 0."""
     return mean + jnp.einsum("pas,s->pa", directions[..., : betas.shape[0]], betas, precision=EXACT)
 

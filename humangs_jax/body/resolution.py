@@ -55,9 +55,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         edges, edge_of_side = _edges(faces)
         lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
         if lengths.max() > FINEST * longest:
-            raise ValueError(
-                f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m"
-            )
+            raise ValueError(f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m")
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
             break
@@ -162,9 +160,7 @@ def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.
         frame = np.stack([right, np.cross(forward, right), forward])
         (right_of, above, depth), own = frame @ points.T, frame @ vertices.T
         left, low = right_of.min(), above.min()
-        cells = lambda x, y, left=left, low=low: (
-            columns * ((x - left) / cell).astype(int) + ((y - low) / cell).astype(int)
-        )
+        cells = lambda x, y, left=left, low=low: columns * ((x - left) / cell).astype(int) + ((y - low) / cell).astype(int)
         buffer = np.full(columns * columns, np.inf)
         np.minimum.at(buffer, cells(right_of, above), depth)
         seen += own[2] < buffer[cells(own[0], own[1])] + 2 * cell
@@ -401,9 +397,7 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
         order, into = np.asarray(body.collapse_order), np.asarray(body.collapse_into)
     smallest = int(np.sum(into == np.arange(total)))
     if vertex_count < smallest:
-        raise ValueError(
-            f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most"
-        )
+        raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most")
     kept = np.flatnonzero(order < vertex_count)
     target = _follow(into, order < vertex_count)
     renumber = np.full(total, -1)

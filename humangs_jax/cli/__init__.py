@@ -112,9 +112,7 @@ def execute(arguments: Sequence[str]) -> int:
             return _interrupted()
         if isinstance(error, ValueError | OSError):
             return _failed(error, verbose)
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(
-            error
-        ):  # numpy; XLA, whose text has many lines
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):  # numpy; XLA, whose text has many lines
             return _failed(MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose)
         raise
     finally:

@@ -101,12 +101,8 @@ class Render:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[Shot]
-    camera: Annotated[Path | None, arg(help=f"Of Gaussians: cameras of a file, in its world. {CAMERAS.listed()}")] = (
-        None
-    )
-    out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = (
-        Path("views")
-    )
+    camera: Annotated[Path | None, arg(help=f"Of Gaussians: cameras of a file, in its world. {CAMERAS.listed()}")] = None
+    out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = Path("views")
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
     views: Annotated[int | None, at_least(1)] = None
@@ -183,9 +179,7 @@ class Render:
             from humangs_jax.avatar.splat_views import circle_cameras, file_cameras, splat_images, write_splat_views
             from humangs_jax.avatar.video import check_video, write_video
 
-            check_video(
-                self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != ""
-            )
+            check_video(self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != "")
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             gaussians = load_gaussians(self.avatar)

@@ -36,9 +36,7 @@ if TYPE_CHECKING:
 
 DEMO_REFINE = "15s"
 
-_USUAL_UP = (
-    f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers expect, else y."
-)
+_USUAL_UP = f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers expect, else y."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,9 +278,7 @@ def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     return photos
 
 
-def _refine_and_save(
-    avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig | None", live: bool = False
-) -> None:
+def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig | None", live: bool = False) -> None:
     """Refine with a progress bar if asked, write the result (now and then, if live), say what it took.
 
     Raises: KeyboardInterrupt, after that, if one ended it.

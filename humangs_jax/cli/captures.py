@@ -191,9 +191,7 @@ class Synth:
         for name, value in small.items():
             if getattr(self, name) not in (value, defaults[name]):
                 option = name.replace("_", "-")
-                raise UsageError(
-                    f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}"
-                )
+                raise UsageError(f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}")
         with stage("starting"):
             from humangs_jax.people.writer import Layout, write_set
 

@@ -76,9 +76,7 @@ class Evaluate:
         for net in ("vgg", "alex", "squeeze"):
             if found := getattr(self.lpips, f"lpips_{net}"):
                 if len(found) > 2:
-                    raise UsageError(
-                        f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}"
-                    )
+                    raise UsageError(f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}")
                 networks.append(load_lpips(net, *found))
         with stage("evaluating"):
             result = evaluate(

@@ -152,9 +152,7 @@ class Fit:
         detections = self.detections
         if detections.keypoints is None:
             if not available():
-                raise UsageError(
-                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here"
-                )
+                raise UsageError("--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here")
             with stage("finding the person"):
                 detections = Detections(found_here(self.capture, detections.person))
         with stage("reading photos and keypoints"):

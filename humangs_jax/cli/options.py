@@ -59,9 +59,7 @@ class PartOfMotion:
 
     def options(self, path: Path | None) -> tuple[str | Path, ...]:
         """What another command says to play the same; of a file, or nothing."""
-        said = [
-            part for name, value in vars(self).items() if value is not None for part in (option_of(name), str(value))
-        ]
+        said = [part for name, value in vars(self).items() if value is not None for part in (option_of(name), str(value))]
         return () if path is None else ("--motion", path, *said)
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
@@ -162,9 +160,7 @@ def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = 
             raise UsageError(f"{option} {path}: exists and is no avatar: expected another name")
 
 
-def require_file(
-    path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()
-) -> None:
+def require_file(path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()) -> None:
     """A file with one of the suffixes can be written to that path. read: what the command reads. Raises: UsageError."""
     if path.suffix.lower() not in suffixes:
         raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")

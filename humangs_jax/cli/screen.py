@@ -175,9 +175,7 @@ def fail(error: BaseException, verbose: bool) -> None:
 
 def suggest(*command: str | Path) -> None:
     """What to do next: the parts of a command line; paths are quoted, text is not."""
-    progress.current().next.append(
-        " ".join(shlex.quote(str(part)) if isinstance(part, Path) else part for part in command)
-    )
+    progress.current().next.append(" ".join(shlex.quote(str(part)) if isinstance(part, Path) else part for part in command))
 
 
 def finish() -> None:

@@ -306,9 +306,7 @@ class Start:
                 from humangs_jax.apps.start import held_out_psnr
                 from humangs_jax.refinement.config import RefineConfig
 
-                estimate = held_out_psnr(
-                    *weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE)
-                )
+                estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE))
         if estimate is not None:
             tell(estimate)
         with stage("writing the page"):

@@ -184,9 +184,7 @@ class Train:
             files = self.networks
             asked = read_config(self.config)
             installed = bool(asked.loss.lpips or asked.loss.vgg16)
-            networks = load_loss_networks(
-                files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net, installed
-            )
+            networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net, installed)
             settings = fitting_losses(asked, networks)
             if self.steps is not None:
                 settings = dataclasses.replace(settings, steps=self.steps)
@@ -210,9 +208,7 @@ class Train:
         with stage("training"):
             fsdp, out = self.fsdp, self.out
             try:
-                state = train(
-                    settings, body, people, out, validation=others, variables=variables, networks=networks, fsdp=fsdp
-                )
+                state = train(settings, body, people, out, validation=others, variables=variables, networks=networks, fsdp=fsdp)
             except TrainingInterrupted as stopped:  # all is saved, the same command goes on
                 state, interrupted = stopped.state, stopped
         done = None if state is None else int(state.step)

@@ -131,9 +131,7 @@ def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
 def _other_class(classes: tuple[type, ...], value: Any) -> str:
     names = [x.__name__ for x in classes if x is not type(None)]
     given = "None" if value is None else value.__name__ if isinstance(value, type) else type(value).__name__
-    shown = (
-        f" {value!r}" if isinstance(value, str) else f" the class {given}" if isinstance(value, type) else f" {given}"
-    )
+    shown = f" {value!r}" if isinstance(value, str) else f" the class {given}" if isinstance(value, type) else f" {given}"
     hint = next((HINTS[pair] for name in names if (pair := (name, given)) in HINTS), None)
     return f"expected {' or '.join(names)}, got{shown}{f'; {hint}' if hint else ''}"
 

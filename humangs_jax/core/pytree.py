@@ -103,9 +103,7 @@ class Batchable:
         """Size of the first batch axis. Raises: TypeError for one example."""
         if shape := self.batch_shape:
             return shape[0]
-        raise TypeError(
-            f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or iterated"
-        )
+        raise TypeError(f"this {type(self).__name__} is not a batch: it has no length and cannot be indexed or iterated")
 
     def __bool__(self) -> bool:
         """True, whatever the length: `if camera` asks whether there is one."""

@@ -180,9 +180,7 @@ def capture_from_arrays(
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, source, shape_names)
     if frames is None:
         if len(rotations) > 1:
-            raise CaptureError(
-                source, "frames", f"expected a frame for each view, since there are {len(rotations)} poses"
-            )
+            raise CaptureError(source, "frames", f"expected a frame for each view, since there are {len(rotations)} poses")
         frames = np.zeros(v, int)
     numbers(frames, source, "frames", (v,))
     frames = [checked_frame(x.item(), len(rotations), source, f"frames[{i}]") for i, x in enumerate(np.asarray(frames))]
@@ -363,9 +361,7 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
         views.append(view)
     background = "photo" if capture.masks is None else "white"
     poses = capture.poses
-    arrays = parameter_arrays(
-        target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
-    )
+    arrays = parameter_arrays(target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
     write_npz(folder / "body.npz", arrays, compressed=False)
     write_description(folder, views, background)
 

@@ -120,9 +120,7 @@ def check_range(array: np.ndarray, file: object, field: str) -> None:
 # Parts of a capture --------------------------------------------------------------------------------------------------
 
 
-def checked_camera(
-    K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str
-) -> Camera:
+def checked_camera(K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str) -> Camera:
     """A camera of a rigid, right-handed pose."""
     try:
         return Camera.from_opencv(K, cam_from_world, width, height)
@@ -149,9 +147,7 @@ def body_parameters(
     joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
     if rotations.ndim != 3 or rotations.shape[1:] != (joints, 3) or len(rotations) == 0:
-        raise CaptureError(
-            file, "rotations", f"expected shape (frames, {joints}, 3) for this body, got {rotations.shape}"
-        )
+        raise CaptureError(file, "rotations", f"expected shape (frames, {joints}, 3) for this body, got {rotations.shape}")
     translations = numbers(translations, file, "translations", (len(rotations), 3))
     betas = numbers(betas, file, "betas")
     for field, array, largest in (
@@ -190,9 +186,7 @@ def shape_coefficients(
     unknown = [name for name, value in zip(names, betas, strict=True) if value and name not in places]
     if unknown:
         known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}" if places else "none"
-        problem = (
-            f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of its own ({known})"
-        )
+        problem = f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of its own ({known})"
         raise CaptureError(file, "betas", problem)
     used = [places[name] for name in names if name in places]
     ordered = np.zeros(max(used, default=-1) + 1, betas.dtype)

@@ -254,9 +254,7 @@ def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_
         cotangent = (u * v).sum(-1) / np.maximum(np.linalg.norm(np.cross(u, v), axis=-1), 1e-10)
         rows, columns, values = [*rows, a, b], [*columns, b, a], [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2]
     size = len(vertices)
-    weights = sparse.coo_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)
-    ).tocsr()
+    weights = sparse.coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsr()
     return (sparse.diags(np.asarray(weights.sum(axis=1))) - weights).tocsr()
 
 

@@ -71,8 +71,7 @@ def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
     rest, per_view = shape_body(capture.body, views.betas), (views.images, views.masks, views.cameras)
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     each = [
-        seen_colors(capture.body, rest, *jax.tree.map(lambda x, i=i: x[i], (poses, *per_view)))
-        for i in range(capture.view_count)
+        seen_colors(capture.body, rest, *jax.tree.map(lambda x, i=i: x[i], (poses, *per_view))) for i in range(capture.view_count)
     ]
     colors, seen = (np.stack(x) for x in zip(*each, strict=True))
     return gains_of(colors, seen)

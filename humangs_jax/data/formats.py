@@ -236,9 +236,7 @@ class MotionFormat(Format):
 def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None, **more: Any) -> MotionFormat:
     """keys: separated by spaces; poses: as "root=global_orient limbs=body_pose"."""
     places = dict(each.split("=") for each in poses.split())
-    return MotionFormat(
-        about, ARRAYS, ARRAY_SUFFIXES, arrays=ArrayKeys(tuple(keys.split()), places, **(use or {}), **more)
-    )
+    return MotionFormat(about, ARRAYS, ARRAY_SUFFIXES, arrays=ArrayKeys(tuple(keys.split()), places, **(use or {}), **more))
 
 
 _FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
@@ -251,18 +249,14 @@ _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAME
 """Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(
-    humangs=_arrays(
-        *("ours", "rotations", "all=rotations"), moves=("translations",), rates=("fps",), fixed=True, kind="ours"
-    ),
+    humangs=_arrays(*("ours", "rotations", "all=rotations"), moves=("translations",), rates=("fps",), fixed=True, kind="ours"),
     aist=_arrays(
         *("AIST++", "smpl_poses", "all=smpl_poses"),
         use={"moves": ("smpl_trans",), "rates": ("fps",), "fps": 60.0, "fixed": True, "scaling": "smpl_scaling"},
     ),
     wham=_arrays("WHAM", "pose_world trans_world", "all=pose_world", use=_ALONE | {"moves": ("trans_world",)}),
     tram=_arrays("TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}),
-    human3r=_arrays(
-        "Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}
-    ),
+    human3r=_arrays("Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}),
     sam3d=_arrays(
         "SAM 3D Body",
         "pred_joint_coords",

@@ -60,9 +60,7 @@ class _Shift(NamedTuple):
     thin: float = 0.0
 
 
-def fit_mask(
-    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], float]:
+def fit_mask(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "h w"], float]:
     """`masks_at_edges` of one view."""
     return masks_at_edges([image], [mask])[0]
 
@@ -150,9 +148,7 @@ def boundary_moves(
     return whole, ndimage.gaussian_filter(moves, SMOOTHING * unit)
 
 
-def sector_votes(
-    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
-) -> tuple[int, int]:
+def sector_votes(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float) -> tuple[int, int]:
     """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how many do not, or have one
     where the mask ends. Sectors whose edge is not clear say nothing; nor do those where both sides of it are white.
     """
@@ -238,9 +234,7 @@ def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values say how far."""
     inside = mask >= 0.5
-    whole = np.where(
-        inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)
-    )
+    whole = np.where(inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside))
     partly = (mask > 0.02) & (mask < 0.98) & (np.abs(whole) < 1.01)
     return np.where(partly, mask - 0.5, whole)
 

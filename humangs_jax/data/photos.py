@@ -137,9 +137,7 @@ def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file
 def check_background(background: Any, file: object) -> None:
     """One of `Background`."""
     if background not in get_args(Background):
-        raise CaptureError(
-            file, "background", f"expected one of {', '.join(get_args(Background))}, got {shown(background)}"
-        )
+        raise CaptureError(file, "background", f"expected one of {', '.join(get_args(Background))}, got {shown(background)}")
 
 
 def read_frames_and_matrices(
@@ -215,9 +213,7 @@ def _check_orientations(
         flagged.append(file.name)
         stored, shown = (np.abs(camera[:2, 2] / size - 0.5).max() for size in ((width, height), (height, width)))
         if flag >= 5 and shown < stored - OFF_CENTER:
-            problem = (
-                f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned, without the flag"
-            )
+            problem = f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned, without the flag"
             raise CaptureError(file, "orientation", problem)
     if flagged and warns:
         told = "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras` turns such photos)"
@@ -318,9 +314,7 @@ def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarr
             sizes += " (is one of them turned by an EXIF orientation?)"
         raise CaptureError(file, "size", f"{sizes}: expected the same")
     top, some = float(mask.max()), np.count_nonzero(mask) > LEAST_LABELLED * mask.size
-    if some and (
-        top <= LARGEST_LABEL or (top < NEARLY_WHITE and mask.min() == 0 and ((mask == 0) | (mask == top)).all())
-    ):
+    if some and (top <= LARGEST_LABEL or (top < NEARLY_WHITE and mask.min() == 0 and ((mask == 0) | (mask == top)).all())):
         problem = f"the largest is {255 * top:.3g} of 255: expected 0 (background) to 255 (person)"
         raise CaptureError(file, "values", problem)
     return mask
@@ -336,9 +330,7 @@ def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
         raise CaptureError("", "", error) from error
 
 
-def on_white_background(
-    image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]
-) -> Float[np.ndarray, "*v h w 3"]:
+def on_white_background(image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]) -> Float[np.ndarray, "*v h w 3"]:
     """The masked part over white."""
     return image * mask[..., None] + (1 - mask[..., None])
 

@@ -219,9 +219,7 @@ def cropped(capture: Capture, size: int) -> Capture:
         boxes.append((*((low + high - side) // 2).tolist(), side))
     if min(side for *_, side in boxes) >= max(height, width):
         return capture
-    cut = lambda array, fill: np.stack(
-        [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
-    )
+    cut = lambda array, fill: np.stack([resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)])
     left, top, sides = np.asarray(boxes, np.float32).T
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
@@ -230,9 +228,7 @@ def cropped(capture: Capture, size: int) -> Capture:
     return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=cut(capture.masks, 0.0), cameras=cameras)
 
 
-def _window(
-    image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float
-) -> Float[np.ndarray, "side side *c"]:
+def _window(image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float) -> Float[np.ndarray, "side side *c"]:
     """A square of an image, filled up where it reaches beyond."""
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)
@@ -250,9 +246,7 @@ def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
     return replace(views, cameras=cameras, rotations=poses.rotations, translations=poses.translation)
 
 
-def upright_world(
-    poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]
-) -> tuple[BodyPose, Camera]:
+def upright_world(poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]) -> tuple[BodyPose, Camera]:
     """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs does.
 
     Captures are to have y up. One with z up is as consistent, but the network has seen no such world, and an avatar's light is
@@ -333,9 +327,7 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
     if count is not None and len(usable) <= count:
         return usable
     capture = capture.select(usable)
-    body = (
-        decimate(capture.body, SELECTION_VERTICES) if len(capture.body.template) > SELECTION_VERTICES else capture.body
-    )
+    body = decimate(capture.body, SELECTION_VERTICES) if len(capture.body.template) > SELECTION_VERTICES else capture.body
     quality = np.asarray(_quality(body, standardize(capture, SELECTION_SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
     least = LEAST_GAIN if count is None else 0.0

@@ -221,9 +221,7 @@ def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray
         affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
         size = (int(right - left), int(bottom - top))
         picture = Image.fromarray(found.mask.astype(np.float32))
-        mask[top:bottom, left:right] = picture.transform(
-            size, Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR
-        )
+        mask[top:bottom, left:right] = picture.transform(size, Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR)
     return mask
 
 

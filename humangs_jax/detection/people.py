@@ -114,9 +114,7 @@ def _settled(networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop) 
     return look, float(drift)
 
 
-def window_detections(
-    networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
-) -> list[Detection]:
+def window_detections(networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]) -> list[Detection]:
     """What the detector finds in the windows with these shares of the longer side."""
     height, width = photo.shape[:2]
     return [each for window in windows(width, height, shares) for each in networks.detect(photo, window)]
@@ -178,9 +176,7 @@ MOST = 2.0
 """Pixels of the reduced photo for one of the detector's mask."""
 
 
-def sharpened(
-    mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
-) -> Float[np.ndarray, "h w"]:
+def sharpened(mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float) -> Float[np.ndarray, "h w"]:
     """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the detector's mask."""
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):

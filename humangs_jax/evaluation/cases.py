@@ -117,9 +117,7 @@ def find_people(
     return People(tuple(case.name for case in cases), cases.__getitem__)
 
 
-def _load(
-    folder: Path, inputs: int | None, indices: Indices | None, body: BodyModel | None, reconstructs: bool
-) -> Case:
+def _load(folder: Path, inputs: int | None, indices: Indices | None, body: BodyModel | None, reconstructs: bool) -> Case:
     capture, held_out = load_capture(folder, body=body), folder / HELD_OUT
     if indices is not None or not (held_out / "capture.json").is_file():
         return _split(folder.name, capture, inputs, indices, reconstructs)
@@ -198,9 +196,7 @@ def choose_views(
     return chosen, targets
 
 
-def spread_views(
-    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
-) -> list[int]:
+def spread_views(name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int) -> list[int]:
     """Views of the first view's frame, that one among them, evenly spaced around the person; in order. Raises: ValueError."""
     same = np.flatnonzero(np.asarray(frames) == frames[0])
     if not 1 <= count <= len(same):

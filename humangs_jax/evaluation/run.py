@@ -78,9 +78,7 @@ class Gallery:
         self._limit = limit
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
-    def add(
-        self, row: int, psnr: float | None, truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]
-    ) -> None:
+    def add(self, row: int, psnr: float | None, truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]) -> None:
         """An image and its truth; row: its number among the rows."""
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self._limit and (not self._shots or key <= self._shots[0][0]):
@@ -189,13 +187,9 @@ class Evaluation:
         side = self.protocol.published_side
         if side is not None and self.about["sides"] != [[side, side]]:
             found = ", ".join(f"{width} x {height}" for width, height in self.about["sides"])
-            notes.append(
-                f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}."
-            )
+            notes.append(f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}.")
         if self.about["everything"]:
-            notes.append(
-                "Compared on all views of the captures: if some of them were inputs, name those that were not."
-            )
+            notes.append("Compared on all views of the captures: if some of them were inputs, name those that were not.")
         if self.missing:
             notes.append(f"{_counted(len(self.missing), 'prediction', 'predictions')} missing: {_listed(self.missing)}")
         return notes
@@ -331,9 +325,7 @@ def evaluate(
     }
     reasons = missing_reasons(rules, networks, masks, alphas)
     unknown = [score for score in score_names(rules) if all(row.scores[score] is None for row in rows)]
-    reasons |= {
-        score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons
-    }
+    reasons |= {score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons}
     label = protocol if isinstance(protocol, str) else "custom"
     return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
 

@@ -216,9 +216,7 @@ class _Seen:
         if ((weights > 0).any((0, 1))).sum() < 8:
             return None
         points = as_double("points")[:, :, kinds]
-        return cls(
-            points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], camera_of, count
-        )
+        return cls(points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], camera_of, count)
 
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
         """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and Hessians (k, 3 n, 3 n), in
@@ -279,17 +277,13 @@ class _Seen:
         focal = np.stack([self.K[..., 0, 0], self.K[..., 1, 1]], axis=-1)[:, :, None]
         return rotation, local, depth, local[..., :2] / depth[..., None], focal
 
-    def _errors(
-        self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
-    ) -> Float[np.ndarray, "m c k 2"]:
+    def _errors(self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]) -> Float[np.ndarray, "m c k 2"]:
         _, _, _, slope, focal = self._project(turned, points)
         return slope * focal + self.K[:, :, None, :2, 2] - self.points
 
     def _linear(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"], weights: Float[np.ndarray, "m c k"]
-    ) -> tuple[
-        Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"], Float[np.ndarray, "m c k 2"], Float[np.ndarray, "m k 3"]
-    ]:
+    ) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"], Float[np.ndarray, "m c k 2"], Float[np.ndarray, "m k 3"]]:
         """Gradients and Hessians at rotations, the residuals, and the points after one more step of Gauss and Newton."""
         rotation, local, depth, slope, focal = self._project(turned, points)
         errors = slope * focal + self.K[:, :, None, :2, 2] - self.points

@@ -119,9 +119,7 @@ def _read_fit_record(path: Path) -> FitRecord:
 # Captures ------------------------------------------------------------------------------------------------------------
 
 
-def check_place(
-    source: str | Path, out: str | Path | None, overwrite: bool, inputs: Iterable[str | Path | None] = ()
-) -> Path:
+def check_place(source: str | Path, out: str | Path | None, overwrite: bool, inputs: Iterable[str | Path | None] = ()) -> Path:
     """The folder that a fit of the capture `source` is written to, checked before the work begins.
 
     Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced. inputs: further files and
@@ -156,9 +154,7 @@ def write_fitted(
     description = read_description(source / "capture.json")
     contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
     name, poses = description["body"], capture.poses
-    arrays = parameter_arrays(
-        target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
-    )
+    arrays = parameter_arrays(target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
 
     def write_fit(folder: Path):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -130,9 +130,7 @@ def _derivatives(
 
     def frame(seen, own):
         vector = jnp.concatenate([own.global_orient, own.transl, own.body_pose.ravel()])
-        (by_pose, by_shape), (joints_by_pose, joints_by_shape) = jax.jacfwd(both, argnums=(1, 2))(
-            seen, vector, own.betas
-        )
+        (by_pose, by_shape), (joints_by_pose, joints_by_shape) = jax.jacfwd(both, argnums=(1, 2))(seen, vector, own.betas)
         return by_pose, by_shape, joints_by_pose, joints_by_shape
 
     m = len(observations.noise)
@@ -190,9 +188,7 @@ def examine(
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
     noise = (
-        noise[: len(views)]
-        if noise is not None
-        else np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
+        noise[: len(views)] if noise is not None else np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
     )
     outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
 
@@ -213,10 +209,7 @@ def examine(
         undetermined=undetermined_joints(capture.body.joint_names, compared.any((1, 2)), *known),
         notes=_worst_frame(frames),
         warnings=(
-            *(
-                f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}"
-                for error in find_camera_errors(capture, keypoints)
-            ),
+            *(f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}" for error in find_camera_errors(capture, keypoints)),
             *keypoint_warnings(rows, expected, violations, swaps),
         ),
     )
@@ -263,9 +256,7 @@ def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
     return (f"frames: median error {middle:.1f} px, worst in frame {worst}: {frames[worst]:.1f} px",)
 
 
-def _view_report(
-    name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]
-) -> ViewReport:
+def _view_report(name: str, frame: int, lengths: Float[np.ndarray, " k"], outliers: Bool[np.ndarray, " k"]) -> ViewReport:
     count = int(np.isfinite(lengths).sum())
     share = float(outliers.sum() / max(count, 1))
     return ViewReport(name, frame, count, _quantile(lengths, 0.5), _quantile(lengths, 0.9), share)
@@ -339,9 +330,7 @@ def fit_photos(
     if len(keypoints.points) != len(photos.names):
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos")
     if body.parents.index(-1) != 0:
-        raise ValueError(
-            f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
-        )
+        raise ValueError(f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}")
     errors = () if fixed_cameras else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
     photos = mended(photos, errors) if errors else photos
     kind = keypoints.set

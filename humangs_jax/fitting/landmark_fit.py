@@ -221,15 +221,11 @@ def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     return np.stack([m for m in signed if np.linalg.det(m) > 0])
 
 
-def _kabsch(
-    a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
-) -> Float[Array, "3 3"]:
+def _kabsch(a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]) -> Float[Array, "3 3"]:
     """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
-    u, _, vt = jnp.linalg.svd(
-        jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT) + 1e-9 * jnp.eye(3)
-    )
+    u, _, vt = jnp.linalg.svd(jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT) + 1e-9 * jnp.eye(3))
     sign = jnp.sign(jnp.linalg.det(jnp.matmul(u, vt, precision=EXACT)))
     return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
 
@@ -252,9 +248,7 @@ def _position(
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
-def _metres_per_pixel(
-    seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]
-) -> Float[Array, ""]:
+def _metres_per_pixel(seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]) -> Float[Array, ""]:
     """Metres per pixel at the person's distance."""
     centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
@@ -348,9 +342,7 @@ def _certainty_found(problem: KeypointProblem, observations: Observations, state
     return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
 
 
-def _person_residuals(
-    problem: KeypointProblem, observations: Observations, state: FitState
-) -> dict[str, Float[Array, "..."]]:
+def _person_residuals(problem: KeypointProblem, observations: Observations, state: FitState) -> dict[str, Float[Array, "..."]]:
     """All frames at once with one shape."""
     of_frame = lambda seen, own: frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
@@ -439,7 +431,5 @@ def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> F
     )
     bridged = jax.vmap(lambda pose: state_of(problem.origin, betas, pose))(between)
     pick = lambda new, old: jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
-    moved = {
-        name: pick(getattr(bridged, name), getattr(state, name)) for name in ("global_orient", "transl", "body_pose")
-    }
+    moved = {name: pick(getattr(bridged, name), getattr(state, name)) for name in ("global_orient", "transl", "body_pose")}
     return replace(state, **moved)

@@ -219,9 +219,7 @@ def _centered(values: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
     return values - (weights[:, None] * values).sum(0) / weights.sum()
 
 
-def _evidence(
-    seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]
-) -> tuple[Evidence, Rig]:
+def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
     """Evidence with left and right of some views exchanged, and cameras to start from."""
     focal, std = _focal_lengths(seen)
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
@@ -304,9 +302,7 @@ class _Trial:
 def _least(seen: PersonViews, mirror: Int[np.ndarray, " k"], start: _Trial) -> _Trial:
     """View after view is mirrored while that explains the landmarks clearly better."""
     while True:
-        trials = [
-            _try(seen, mirror, start.mirrored ^ (np.arange(len(seen.points)) == v)) for v in range(len(seen.points))
-        ]
+        trials = [_try(seen, mirror, start.mirrored ^ (np.arange(len(seen.points)) == v)) for v in range(len(seen.points))]
         best = min(trials, key=lambda each: each.cost)
         if not best.cost < CLEARLY * start.cost:
             return start
@@ -381,10 +377,7 @@ def _in_world(seen: PersonViews, rig: Rig, height: float | None) -> tuple[tuple[
     scale = 1.0
     if height is not None:
         part = lambda a, b: np.mean(
-            [
-                np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")])
-                for s in ("left", "right")
-            ]
+            [np.linalg.norm(points[names.index(f"{s}_{a}")] - points[names.index(f"{s}_{b}")]) for s in ("left", "right")]
         )
         scale = height / (STATURE * (np.linalg.norm(shoulders - hips) + part("hip", "knee") + part("knee", "ankle")))
     turned = scale * points @ world_from_rig.T

@@ -131,9 +131,7 @@ def usual_config(
     if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
         config = dataclasses.replace(config, keypoints_worse=math.inf)
     if tight:
-        config = dataclasses.replace(
-            config, std=dataclasses.replace(config.std, clothing=TIGHT, betas=2.0, body_pose=10.0)
-        )
+        config = dataclasses.replace(config, std=dataclasses.replace(config.std, clothing=TIGHT, betas=2.0, body_pose=10.0))
     if bare:
         std = dataclasses.replace(config.std, clothing=SKIN)
         config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))

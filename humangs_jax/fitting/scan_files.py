@@ -164,9 +164,7 @@ def checked_joints(joints: Mapping[str, Any]) -> tuple[Float[np.ndarray, "k 3"],
     Raises: ValueError for unknown names and points that are not three finite numbers.
     """
     if unknown := sorted(set(joints) - set(SCAN_LANDMARKS)):
-        raise ValueError(
-            f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}"
-        )
+        raise ValueError(f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}")
     points, known = np.zeros((len(SCAN_LANDMARKS), 3)), np.zeros(len(SCAN_LANDMARKS))
     for name, point in joints.items():
         values = np.asarray(point)
@@ -213,9 +211,7 @@ DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
 AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")}
 
 
-def render_scan_views(
-    mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None
-) -> Path:
+def render_scan_views(mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None) -> Path:
     """Write images of a scan from all around as a capture folder without a body.
 
     Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
@@ -299,9 +295,7 @@ def _draw(
     for view in range(views):
         camera = cameras[view]
         fragments = rasterize_mesh(number(vertices), jnp.asarray(faces, jnp.int32), camera)
-        painted = np.asarray(
-            interpolate_attributes(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3))
-        )
+        painted = np.asarray(interpolate_attributes(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3)))
         face = np.asarray(fragments.face_ids)
         facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
         shade = np.where(face >= 0, 0.45 + 0.55 * facing[np.maximum(face, 0)], 1.0)
@@ -316,9 +310,7 @@ def _write(folder: Path, drawn: Iterable[View], cameras: Camera, align: Similari
         files = {kind: f"{kind}s/{view:03d}.png" for kind in ("image", "mask")}
         write_png(folder / files["image"], image)
         write_png(folder / files["mask"], mask)
-        matrices = {
-            key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")
-        }
+        matrices = {key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")}
         listed.append({**files, "frame": 0, **matrices})
     write_description(folder, listed, "white")
     write_json(folder / SCAN_FILE, {"world_from_scan": align.matrix().tolist()}, indent=None)

@@ -124,9 +124,7 @@ def fit_scan(
         iterations = (*CLOSER, *FINE)
     target = Target(scan, start.align, config.points, effective, FINE_NORMAL)
     if clothed:
-        iterations = tuple(
-            dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations
-        )
+        iterations = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations)
     state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)

@@ -121,9 +121,7 @@ def leftover(problem: ScanProblem, target: Target, given: Given, tolerances: Tol
 
 
 @jax.jit
-def _cost(
-    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState
-) -> Float[Array, ""]:
+def _cost(problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState) -> Float[Array, ""]:
     return half_squares(scan_residuals(problem, matches, given, tolerances, state))
 
 

@@ -91,6 +91,4 @@ def _solve(
     better = after <= before  # False for NaN
     converged = better & (found.result == optimistix.RESULTS.successful)
     value = hold(jnp.where(better, found.value, flat))
-    return unravel(value), Outcome(
-        before, jnp.where(better, after, before), jnp.asarray(found.stats["num_steps"]), converged
-    )
+    return unravel(value), Outcome(before, jnp.where(better, after, before), jnp.asarray(found.stats["num_steps"]), converged)

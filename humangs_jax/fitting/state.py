@@ -54,9 +54,7 @@ _FINGER = Range((0.0, 0.0, -0.35), (0.1, 0.1, 0.5), (-0.4, -0.4, -1.9), (0.4, 0.
 _KNUCKLE = Range((0.0, 0.0, -0.3), (0.15, 0.2, 0.5), (-0.5, -0.6, -1.8), (0.5, 0.6, 0.6))
 
 RANGES = {
-    "pelvis": Range(
-        (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED)
-    ),
+    "pelvis": Range((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED)),
     "spine1": _SPINE,
     "spine2": _SPINE,
     "spine3": _SPINE,
@@ -91,9 +89,7 @@ class PosePrior:
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
     """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no limits."""
-    unknown = Range(
-        (0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED)
-    )
+    unknown = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED))
     rows = [_range_of(name, unknown) for name in joint_names]
     return PosePrior(*(np.stack([row[i] for row in rows]).astype(np.float32) for i in range(4)))
 
@@ -106,9 +102,7 @@ def limit_residuals(prior: PosePrior, joints: tuple[int, ...], rotations: Float[
     return LIMIT_STIFFNESS * jnp.maximum(beyond, 0.0)
 
 
-def violations(
-    prior: PosePrior, rotations: Float[np.ndarray, "j 3"], slack: float = 0.05
-) -> list[tuple[int, int, float]]:
+def violations(prior: PosePrior, rotations: Float[np.ndarray, "j 3"], slack: float = 0.05) -> list[tuple[int, int, float]]:
     """(joint, axis, radians beyond the limit) of all components that exceed their limit by more than `slack` radians."""
     beyond = np.maximum(prior.lower - rotations, rotations - prior.upper)
     return [(int(j), int(a), float(beyond[j, a])) for j, a in np.argwhere(beyond > slack)]
@@ -337,9 +331,7 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"], shared_focal: 
     return CameraOrigin(cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames)))
 
 
-def camera_numbers(
-    K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float
-) -> Int[np.ndarray, " v"]:
+def camera_numbers(K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float) -> Int[np.ndarray, " v"]:
     """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see below."""
     focal, flat = K[:, :1, 0], lambda values: values.reshape(len(K), -1)
     return _numbered(np.concatenate([np.log(focal), flat(K) / focal, flat(matrices)], axis=1), same)

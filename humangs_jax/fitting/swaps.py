@@ -143,9 +143,7 @@ class Order(NamedTuple):
     source: Int[np.ndarray, "m c"]
     mirrored: Bool[np.ndarray, "m c"]
 
-    def exchanged(
-        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None
-    ) -> "Order":
+    def exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None) -> "Order":
         """The order with the keypoints of cameras a and b exchanged in some frames, or without b left and right of camera a's."""
         source, mirrored = self.source.copy(), self.mirrored.copy()
         if b is None:
@@ -167,9 +165,7 @@ def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: O
     pick = lambda values: jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
     # where left and right are exchanged the detector may have seen the body turned round: its depths say nothing then
     world = None if observations.world is None or order.mirrored.any() else pick(observations.world)
-    return replace(
-        observations, points=pick(observations.points), confidences=pick(observations.confidences), world=world
-    )
+    return replace(observations, points=pick(observations.points), confidences=pick(observations.confidences), world=world)
 
 
 class Agreement(NamedTuple):

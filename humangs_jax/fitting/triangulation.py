@@ -36,9 +36,7 @@ def triangulate(
     points = _nearest(origins, directions, weights)
     for _ in range(REWEIGHTED):
         distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
-        points = _nearest(
-            origins, directions, weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1))
-        )
+        points = _nearest(origins, directions, weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)))
     return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
 
 
@@ -91,9 +89,7 @@ def _rays(observations: Observations) -> tuple[Float[Array, "c 3"], Float[Array,
     rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
     local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
-    directions = safe_normalize(
-        jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0])
-    )
+    directions = safe_normalize(jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0]))
     return -jnp.einsum("cba,cb->ca", rotation, translation, precision=EXACT), directions
 
 

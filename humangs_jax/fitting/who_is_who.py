@@ -147,9 +147,7 @@ def _triangulated(
     return points, known & np.isfinite(points).all(-1)
 
 
-def _error(
-    view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Bool[np.ndarray, " k"]
-) -> float:
+def _error(view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Bool[np.ndarray, " k"]) -> float:
     """Median distance of landmarks from points over the size of the person; infinite behind the camera or with few in common."""
     seen = known & (row[:, 2] >= SEEN)
     if seen.sum() < FEWEST:
@@ -158,9 +156,7 @@ def _error(
     if np.median(local[:, 2]) <= 0:
         return float("inf")
     pixels = local @ view.K.T
-    distances = np.linalg.norm(
-        pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1
-    )
+    distances = np.linalg.norm(pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1)
     size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
 

@@ -71,9 +71,7 @@ class Camera(Batchable):
             raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
         rotation = cam_from_world[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise ValueError(
-                "cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)"
-            )
+            raise ValueError("cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)")
         if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
             raise ValueError(f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}")
         return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
@@ -203,9 +201,7 @@ def orbit(
     azimuths = jnp.asarray(azimuths)
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):
         raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
-    distance, elevations = (
-        jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations)
-    )
+    distance, elevations = (jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations))
 
     def one(r, azimuth, elevation):
         horizontal = jnp.cos(elevation)

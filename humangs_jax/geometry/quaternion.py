@@ -168,9 +168,7 @@ def left_singular_vectors(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3
     return _complete_to_rotation(jnp.stack(columns, axis=-1), norms), norms
 
 
-def _orthogonalize(
-    a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]
-) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+def _orthogonalize(a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Rotate two columns in their plane until they are orthogonal."""
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0

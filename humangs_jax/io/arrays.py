@@ -184,9 +184,7 @@ class ArrayFile:
         except (ValueError, TypeError, OverflowError) as error:
             raise self.error(self.path, key, error) from error
 
-    def numbers(
-        self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
-    ) -> Float[np.ndarray, "..."]:
+    def numbers(self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf) -> Float[np.ndarray, "..."]:
         """Finite float64 numbers under a key, at least one, see `numbers`."""
         return numbers(self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error)
 

@@ -24,9 +24,7 @@ ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
 TOLD = 12
 """Entries of a folder that are named before it is deleted; the others are counted."""
-_TEMPORARY = re.compile(
-    r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
-)
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?")
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
@@ -208,9 +206,7 @@ def _told(entry: Path) -> str:
     return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
-def add_files(
-    folder: str | os.PathLike, write: Callable[[Path], object], *, without: Iterable[str | os.PathLike] = ()
-) -> None:
+def add_files(folder: str | os.PathLike, write: Callable[[Path], object], *, without: Iterable[str | os.PathLike] = ()) -> None:
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
     The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom

@@ -150,9 +150,7 @@ def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
     return pixels[:: -1 if flag in rows else 1, :: -1 if flag in columns else 1]
 
 
-def write_png(
-    path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], compress_level: int = 6
-) -> None:
+def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], compress_level: int = 6) -> None:
     """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
 
     A fourth channel is alpha. compress_level: of zlib; 1 takes a third of the time and a sixth more room. The file appears whole

@@ -211,9 +211,7 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         for part in parts:
             if part.vertices.shape[1:] != (3,) or part.faces.shape[1:] != (3,):
-                raise Refused(
-                    f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three numbers for each"
-                )
+                raise Refused(f"vertices {part.vertices.shape}, faces {part.faces.shape}: expected three numbers for each")
             low, high = int(part.faces.min()), int(part.faces.max())
             if low < 0 or high >= len(part.vertices):
                 raise Refused(f"a face has the corner {low if low < 0 else high}, but there are {len(part.vertices)}")

@@ -25,9 +25,7 @@ PLAIN_KINDS = "biufcSU"
 """Kinds of dtypes that are read: numbers and strings, no objects, no records."""
 
 
-def read_npz(
-    path: str | Path, wanted: Callable[[str], bool] | None = None
-) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def read_npz(path: str | Path, wanted: Callable[[str], bool] | None = None) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """The arrays of an npz archive by name, and the names of the entries that are pickled objects (never read).
 
     Arguments: wanted: which names to read; None: all.
@@ -68,9 +66,7 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> Generator[zipfile.Zi
         members = archive.infolist()
         if len({member.filename for member in members}) < len(members):
             raise Refused("two members of one name")
-        if strange := [
-            m.filename for m in members if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-        ]:
+        if strange := [m.filename for m in members if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)]:
             raise Refused(f"{strange[0]}: compressed by a method that is not read")
         check_unpacked(size, sum(member.file_size for member in members))
         yield archive

@@ -206,9 +206,7 @@ class _Array(StandIn):
     def set_state(self, state: Any) -> None:
         if isinstance(state, tuple) and len(state) == 5:
             _, shape, dtype, columns_first, data = state
-            self.state.update(
-                shape=shape, dtype=dtype, columns_first=columns_first is True or columns_first == 1, data=data
-            )
+            self.state.update(shape=shape, dtype=dtype, columns_first=columns_first is True or columns_first == 1, data=data)
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["shape"], self.state["data"]
@@ -374,9 +372,7 @@ def _check_leaves(value: Any) -> None:
         items, depth = waiting.pop()
         left -= len(items)
         if depth > 8 or left < 0:
-            raise ValueError(
-                f"expected an array, got lists that are nested too deeply or of more than {LONGEST_LIST:,}"
-            )
+            raise ValueError(f"expected an array, got lists that are nested too deeply or of more than {LONGEST_LIST:,}")
         for item in items:
             if isinstance(item, list | tuple):
                 waiting.append((item, depth + 1))

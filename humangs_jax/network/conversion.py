@@ -175,9 +175,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     per_pixel = PIXEL_CHANNELS + 3 * channels
     patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
     if patch * patch * per_pixel != patch_numbers:
-        raise ValueError(
-            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
-        )
+        raise ValueError(f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels")
     upsampler, output_width = None, None
     if has("upsampler."):
         upsampler = UpsamplerConfig(hidden=shape("upsampler.proj.0.weight", 4)[0])

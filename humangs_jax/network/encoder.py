@@ -151,9 +151,7 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
     """
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):
-        raise ValueError(
-            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
-        )
+        raise ValueError(f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}")
     unit = subject_unit(inputs.canonical_vertices)
     cameras = inputs.cameras.in_units(unit)
     twice = run.conventions.ray_origins == "twice_normalized"

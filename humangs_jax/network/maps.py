@@ -45,9 +45,7 @@ def texel_indices(
     return pixels / image * (grid - 1)
 
 
-def sample_bilinear(
-    grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
-) -> Float[Array, "*p c"]:
+def sample_bilinear(grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0) -> Float[Array, "*p c"]:
     """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
 
     origin: the texel index, in both axes, that `indices` are relative to; counted from the middle, float32 positions
@@ -68,9 +66,7 @@ def sample_bilinear(
         for dx in (0, 1):
             x, y = x0 + dx, y0 + dy
             exists = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (
-                fraction[..., 1] if dy else 1 - fraction[..., 1]
-            )
+            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (fraction[..., 1] if dy else 1 - fraction[..., 1])
             texel = rows.at[jnp.where(exists, y * width + x, 0)].get(mode="promise_in_bounds")
             total = total + jnp.where(exists, weight, 0.0)[..., None] * texel
     return total
@@ -113,9 +109,7 @@ def sample_neighborhoods(
     for i in range(KERNEL + 1):
         row = [texel(i, j) for j in range(KERNEL + 1)]
         across.append([first[:, :1] * row[b] + second[:, :1] * row[b + 1] for b in range(KERNEL)])
-    taps = [
-        first[:, 1:] * across[a][b] + second[:, 1:] * across[a + 1][b] for a in range(KERNEL) for b in range(KERNEL)
-    ]
+    taps = [first[:, 1:] * across[a][b] + second[:, 1:] * across[a + 1][b] for a in range(KERNEL) for b in range(KERNEL)]
     return jnp.concatenate(taps, axis=-1), jnp.prod(first + second, axis=-1)
 
 

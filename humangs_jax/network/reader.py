@@ -89,9 +89,7 @@ class PixelAlignedReader(Reader):
                 raise ValueError("reader.shells needs posed_normals of the inputs, see `prepare_inputs`")
             photos, points = (inputs.images, inputs.foreground, inputs.depth_maps), (vertices, inputs.posed_normals)
             shells = sample_shells(*photos, cameras, *points, self.shells, inputs.present, grid)
-        return VertexFeatures(
-            local, encoding.global_token, colors, fraction, shells=shells, normals=inputs.canonical_normals
-        )
+        return VertexFeatures(local, encoding.global_token, colors, fraction, shells=shells, normals=inputs.canonical_normals)
 
 
 def project_and_test(inputs: HumanGSInputs, grid: PixelGrid) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:

@@ -26,9 +26,7 @@ class Runtime:
         measured=MEASURED,
     )
     """Patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained."""
-    token_capacity: Room = knob(
-        0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED
-    )
+    token_capacity: Room = knob(0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED)
     """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and `stack_captures` fit it to the
     photos; in training it is for the largest number of photos, see `training.forward.token_share`."""
     dtype: ComputeType = knob(
@@ -42,9 +40,7 @@ class Runtime:
         "auto", cost="none", gain="chunked: a third of the time on CPUs, memory linear in tokens", measured=MEASURED
     )
     """See `network.transformer`."""
-    scan: bool = knob(
-        False, cost="a copy of the blocks' parameters", gain="compile time on TPU and GPU", measured=MEASURED
-    )
+    scan: bool = knob(False, cost="a copy of the blocks' parameters", gain="compile time on TPU and GPU", measured=MEASURED)
     """Run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB)."""
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
@@ -64,9 +60,7 @@ class Runtime:
     )
     """Vertices to which the body is decimated, fewer than the weights were trained with, None for no fewer. Gaussians shrink or
     grow with the distance between vertices, so that they cover as much as before."""
-    image_size: InputSide | None = knob(
-        None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE
-    )
+    image_size: InputSide | None = knob(None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE)
     """Side of the photos in pixels, a multiple of the patch size; None: as the weights were trained."""
     crop: bool = knob(
         False,

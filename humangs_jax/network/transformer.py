@@ -94,9 +94,7 @@ def attention(
     if resolved == "chunked":
         return chunked_attention(q, k, v, count)
     lengths = None if count is None else count.astype(jnp.int32)[None]
-    out = jax.nn.dot_product_attention(
-        q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
-    )
+    out = jax.nn.dot_product_attention(q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved)
     return out[0]
 
 
@@ -112,9 +110,7 @@ class Attention(nn.Module):
     def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
         length, width = tokens.shape
         heads, dtype = width // self.head_width, self.runtime.compute_dtype
-        dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
-        )
+        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name)
         qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
         qkv = qkv.reshape(length, 3, heads, self.head_width)
         q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]

@@ -100,9 +100,7 @@ class Upsampler(nn.Module):
         def convolution(features, name):
             return Convolution(features, KAIMING, self.dtype, name=name)
 
-        projected = [
-            nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)
-        ]
+        projected = [nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)]
         x = norm_relu(convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm")
         x = norm_relu(UpConvolution(hidden, self.dtype, name="up1")(x), "up1_norm")
         x = norm_relu(convolution(hidden, "conv1")(x), "conv1_norm")

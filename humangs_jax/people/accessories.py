@@ -279,14 +279,10 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
     # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
-    thin, thick = (
-        surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03)
-    )
+    thin, thick = (surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
     shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
     pairs = (thin.centers, thick.centers), (thin.radii, blurred(thick, 2).radii)
-    shape = hanging(
-        Boundaries(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6
-    )  # the sole is as wide as what is above it
+    shape = hanging(Boundaries(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6)  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]
     rings = []

@@ -286,9 +286,7 @@ def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Fie
     return template, cloth_coordinates(template), arm, leg_membership(template)
 
 
-def measure(
-    vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple
-) -> Anatomy:
+def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple) -> Anatomy:
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)

@@ -70,9 +70,7 @@ def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, 
     return _orbits(targets, distances, azimuths, elevations, image_size)
 
 
-def _orbits(
-    targets: Float[np.ndarray, "v 3"], distances: Angles, azimuths: Angles, elevations: Angles, size: int
-) -> Camera:
+def _orbits(targets: Float[np.ndarray, "v 3"], distances: Angles, azimuths: Angles, elevations: Angles, size: int) -> Camera:
     """A batch of cameras that each look at a target of their own."""
     placed = (jnp.asarray(x, jnp.float32) for x in (targets, distances, azimuths, elevations))
     return _placed(*placed, intrinsics_from_fov(VERTICAL_FOV, size, size), size)

@@ -73,13 +73,9 @@ class OnTheFlyConfig:
     """Samples a side of each pixel."""
     depths: bool = False
     """Also of every view."""
-    views_at_once: Few = knob(
-        1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
-    )
+    views_at_once: Few = knob(1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md")
     """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
-    pixels_per_step: Slots = knob(
-        1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
-    )
+    pixels_per_step: Slots = knob(1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md")
     """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
 
 
@@ -188,9 +184,7 @@ def _views(bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, s
 
     def view(plan):
         u, azimuth, pose, close_share = plan
-        camera = cameras.camera_from(
-            u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size
-        )
+        camera = cameras.camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
         return *draw_view(bank, scene, pose, camera, config), camera
 
     poses = plan[2]
@@ -280,9 +274,7 @@ def _color_points(
     return shading.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
-def _sample(
-    texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]
-) -> Float[Array, "p 6"]:
+def _sample(texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]) -> Float[Array, "p 6"]:
     """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
     size = texture.shape[1]
     at = jnp.clip(at * size - 0.5, 0, size - 1)

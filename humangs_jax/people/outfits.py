@@ -180,9 +180,7 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     return tuple(worn)
 
 
-def _made(
-    rng: np.random.Generator, kind: str, plainness: float, details: Iterable[str] = (), **sizes: float
-) -> Garment:
+def _made(rng: np.random.Generator, kind: str, plainness: float, details: Iterable[str] = (), **sizes: float) -> Garment:
     """A garment in a random fabric."""
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
@@ -202,9 +200,7 @@ def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> 
     return [top, lower]
 
 
-def _top(
-    rng: np.random.Generator, style: str, kind: str, male: bool, waist: float, tucked: bool, outer: bool
-) -> Garment:
+def _top(rng: np.random.Generator, style: str, kind: str, male: bool, waist: float, tucked: bool, outer: bool) -> Garment:
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
     sleeve = row(rng, SLEEVES, kind, long=long, short=short)
     details = {row(rng, MENS_NECKS if male else NECKS, kind)}
@@ -338,9 +334,7 @@ def _extras(rng: np.random.Generator, style: Style, male: bool, years: float, wo
     if eyes < 0.2 + 0.15 * (years > 50):
         put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))
     elif eyes > style.no_sunglasses:
-        put(
-            "sunglasses", 1.0, size=rng.uniform(1.0, 1.3), squareness=rng.uniform(2, 5), wire=rng.uniform(0.0015, 0.003)
-        )
+        put("sunglasses", 1.0, size=rng.uniform(1.0, 1.3), squareness=rng.uniform(2, 5), wire=rng.uniform(0.0015, 0.003))
     carried = rng.random()
     if carried < 0.09 and "headscarf" not in kinds:
         put("backpack", 0.7, size=rng.uniform(0.8, 1.15))

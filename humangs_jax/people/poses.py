@@ -234,9 +234,7 @@ def bend_arm(rng, build: kin.Build, rotations: kin.Rotations, goal: str, side: i
     twist[:, 0] = rng.uniform(-1.0, 0.8, n)
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
-    about_both = np.stack(
-        [forward[:, 1], down[:, 1], down[:, 2]], 1
-    )  # a hanging arm swings about the axis of both shoulders
+    about_both = np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1)  # a hanging arm swings about the axis of both shoulders
     swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
     upper = vector(swing @ matrix(twist)) * mirror
     lower = vector(matrix(flex) @ matrix(pronation)) * mirror
@@ -328,9 +326,7 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
-    blends = (
-        (1 - t) * np.asarray(a) + t * np.asarray(b) for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
-    )
+    blends = ((1 - t) * np.asarray(a) + t * np.asarray(b) for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True))
     _, curls, spread, thumb = blends
     thumb = thumb + rng.normal(0, 0.08)
     for finger, (place, splay) in enumerate(FINGERS):

@@ -175,9 +175,7 @@ def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Ar
     return total
 
 
-def seen_from_behind(
-    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]
-) -> Bool[Array, " f"]:
+def seen_from_behind(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]) -> Bool[Array, " f"]:
     """(f,) whether a point sees the inner side of a face."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0

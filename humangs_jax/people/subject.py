@@ -244,9 +244,7 @@ def _host_arrays(
     return _HOST[id(body)][1:]
 
 
-def _hair(
-    rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool
-) -> list[wardrobe.Piece]:
+def _hair(rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool) -> list[wardrobe.Piece]:
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
     haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut

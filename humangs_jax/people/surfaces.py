@@ -342,9 +342,7 @@ def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.arctan2(d[:, 0], d[:, 1]), np.sqrt(np.sum(d * d, -1))
 
 
-def boundaries(
-    along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
-) -> Boundaries:
+def boundaries(along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float) -> Boundaries:
     """Silhouettes of the points with position `along` (n,) on the axis and (n, 2) across it.
 
     levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half thickness of a slice, metres.

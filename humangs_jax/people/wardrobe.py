@@ -108,9 +108,7 @@ def _put(
     outfit.add(surface, material)
 
 
-def _strip(
-    rng: np.random.Generator, outfit: Outfit, field: Field, fit: Fit, material: Material, layered: bool = False
-) -> None:
+def _strip(rng: np.random.Generator, outfit: Outfit, field: Field, fit: Fit, material: Material, layered: bool = False) -> None:
     """A shell that hides nothing. layered: see `Outfit.add`."""
     outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered)
 

@@ -97,9 +97,7 @@ def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: R
     return replace(avatar, gaussians=jax.tree.map(put, own, new))
 
 
-def _advanced(
-    state: RefineState, stop: int, photos: Photo, avatar: Avatar, settings: RefineConfig, clock: Clock
-) -> RefineState:
+def _advanced(state: RefineState, stop: int, photos: Photo, avatar: Avatar, settings: RefineConfig, clock: Clock) -> RefineState:
     """The state at step `stop`, with buffers in which all fits."""
 
     def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
@@ -111,9 +109,7 @@ def _advanced(
 
 
 @compiled
-def _steps(
-    state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig
-) -> RefineState:
+def _steps(state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig) -> RefineState:
     """The state at step `stop`, one photo a step, in turns; its overflow is that of all steps."""
 
     def one(state: RefineState) -> RefineState:
@@ -152,9 +148,7 @@ def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crop
     half = -(-(side + 2 * MARGIN) // SIDES) * SIDES // 2 - MARGIN
     boxes = [[(int(at) - half, int(at) + half) for at in middles[i]] for i in seen]
     views = replace(views, rotations=views.rotations[seen], translations=views.translations[seen])
-    images, masks, cameras = windows(
-        np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes
-    )
+    images, masks, cameras = windows(np.asarray(views.images)[seen], np.asarray(views.masks)[seen], views.cameras[seen], boxes)
     views = replace(views, images=images, masks=masks, cameras=cameras)
     pixels, borders = _pixels(avatar, views), np.asarray([cameras.width, cameras.height])
     shown = ((pixels > -MARGIN) & (pixels < borders + MARGIN)).all(axis=-1).any(axis=0) | moved

@@ -121,9 +121,7 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
     nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
     pairs = np.sort((own * total + nearest).ravel())
     reverse = nearest * total + own
-    mutual = (
-        pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse if pairs.size else reverse > 0
-    )
+    mutual = pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse if pairs.size else reverse > 0
     share = mutual / np.maximum(mutual.sum(axis=1, keepdims=True), 1)
     return Neighbors(jnp.asarray(np.where(mutual, nearest, own), jnp.int32), jnp.asarray(share, jnp.float32))
 
@@ -323,9 +321,7 @@ def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:
     """Write the variables of a `Refiner`; the file appears whole or not at all."""
     from safetensors.numpy import save
 
-    tensors = {
-        f"{layer}/{name}": np.asarray(x) for layer, own in variables["params"].items() for name, x in own.items()
-    }
+    tensors = {f"{layer}/{name}": np.asarray(x) for layer, own in variables["params"].items() for name, x in own.items()}
     write_bytes(path, save(tensors))
 
 

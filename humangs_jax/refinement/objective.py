@@ -183,9 +183,7 @@ class Comparison:
         return decibels(safe_divide(self.squared, self.pixels))
 
 
-def compare(
-    parameters: Parameters, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig
-) -> Comparison:
+def compare(parameters: Parameters, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig) -> Comparison:
     """Comparison with a photo."""
     splat = dataclasses.replace(splat, visibility=True)
     image, _, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)

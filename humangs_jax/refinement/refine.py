@@ -84,9 +84,7 @@ def refine(
 
     Arguments and errors as of `refine_with_report`.
     """
-    return refine_with_report(
-        avatar, capture, config, seconds=seconds, steps=steps, progress=progress, watch=watch
-    ).avatar
+    return refine_with_report(avatar, capture, config, seconds=seconds, steps=steps, progress=progress, watch=watch).avatar
 
 
 @checked_arguments

@@ -77,9 +77,7 @@ class Clock:
         self.limit, self.seconds = config.steps, config.seconds
         self.began, self.compile_seconds = time.perf_counter(), 0.0
         self.done, self.planned, self.late = 0, None, False
-        self.bar = progress_bar(
-            total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}"
-        )
+        self.bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
 
     def elapsed(self) -> float:
         """Seconds since the start, without compilation."""
@@ -206,9 +204,7 @@ def search(task: Task, start: Found, each: Comparison) -> Iterator[Found]:
 
 def search_by_blocks(task: Task, start: Found, losses: Float[np.ndarray, " v"]) -> Iterator[Found]:
     """The held-out pixels choose the best state; the last one is kept where there are none. losses: of the photos, at first."""
-    hidden = [
-        replace(all, counted=all.counted & ~seen.counted) for all, seen in zip(task.photos, task.seen, strict=True)
-    ]
+    hidden = [replace(all, counted=all.counted & ~seen.counted) for all, seen in zip(task.photos, task.seen, strict=True)]
     any_hidden = any(photo.counted.any() for photo in hidden)  # a small crop may have no block to hold out
     best, highest = start, psnr_of(task, start, hidden)
     if task.config.iterations:

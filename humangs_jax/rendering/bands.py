@@ -39,8 +39,7 @@ def render_in_bands(
         return jax.tree.map(np.asarray, render(gaussians, camera, planned, background))
     drawn = [jax.tree.map(np.asarray, render(gaussians, each, planned, background)) for each in cameras]
     joined = {
-        name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height]
-        for name in ("rgb", "alpha", "depth")
+        name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height] for name in ("rgb", "alpha", "depth")
     }
     return replace(drawn[0], **joined)
 

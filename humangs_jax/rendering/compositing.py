@@ -71,9 +71,7 @@ def composite(
 
 
 def _composite_fwd(splats: Array, lists: TileLists, grid: TileGrid, config: SplatConfig) -> tuple[PyTree, PyTree]:
-    features, transmittance, lengths, peaks = _scheduled(
-        forward_by_blocks, forward_by_chunks, grid, config, splats, *lists
-    )
+    features, transmittance, lengths, peaks = _scheduled(forward_by_blocks, forward_by_chunks, grid, config, splats, *lists)
     return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
 
 
@@ -181,9 +179,7 @@ def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
 
-def moments_about_splat(
-    moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
-) -> Float[Array, "*b 6"]:
+def moments_about_splat(moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b 6"]:
     """Moments of d = (pixel - splat) from those of (pixel - centre of the tile); x, y: (splat - centre)."""
     m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
     about = [m, mx - x * m, my - y * m, mxx - 2 * x * mx + x * x * m, mxy - x * my - y * mx + x * y * m]
@@ -433,9 +429,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             transmittance = jnp.exp(before[:, None] + since)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * transmittance, 0.0)
-            along = sum(
-                row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(splats.shape[1] - FEATURES.start)
-            )
+            along = sum(row[..., FEATURES][..., f, None] * g[:, None, f] for f in range(splats.shape[1] - FEATURES.start))
             gained = weights * along
             seen_before, seen_since = _sums_before(gained, c.tiles, seen_tail)
             behind = total[:, None] - (seen_before[:, None] + seen_since + gained)
@@ -445,9 +439,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             moments = product(slopes.reshape(-1, p), powers, config).reshape(step, CHUNK, 6)
             features = product(weights, jnp.moveaxis(g, 1, 2), config)
             rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
-            tails = (
-                _tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))
-            )
+            tails = (_tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained)))
             return sums.at[item].add(rows, mode="drop"), *tails
 
         sums, tail = jnp.zeros(splats.shape, dtype), _no_tail(t, p, dtype)

@@ -32,9 +32,7 @@ def check_count(count: int) -> None:
         raise ValueError(f"harmonics: expected (g, 3, 3), (g, 8, 3) or (g, 15, 3), got (g, {count}, 3)")
 
 
-def basis(
-    x: Array | np.ndarray | float, y: Array | np.ndarray | float, z: Array | np.ndarray | float, count: int
-) -> list:
+def basis(x: Array | np.ndarray | float, y: Array | np.ndarray | float, z: Array | np.ndarray | float, count: int) -> list:
     """Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z

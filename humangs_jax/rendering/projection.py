@@ -163,9 +163,7 @@ def drawn_camera(camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> Camera
 def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
     """`project` on the image that `config` draws: the first half of `splatting.render`."""
     gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
-    return project(
-        gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats
-    )
+    return project(gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats)
 
 
 def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:

@@ -42,9 +42,7 @@ def render_reference(
 
 
 @jax.jit
-def _reference(
-    gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None
-) -> Rendering:
+def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
@@ -106,9 +104,7 @@ def _project(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> tuple
         size = jnp.asarray([camera.width, camera.height], slopes.dtype)
         extra = config.jacobian_margin * 0.5 * size / focal
         at = jnp.clip(slopes, -center / focal - extra, (size - center) / focal + extra)
-    jacobian = jnp.concatenate(
-        [jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]], axis=-1
-    )
+    jacobian = jnp.concatenate([jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]], axis=-1)
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
     product = functools.partial(jnp.matmul, precision=transform.EXACT)
     image_from_world = product(jacobian, camera.cam_from_world[:3, :3])
@@ -125,9 +121,7 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
         legendre = [0 * z, (-1) ** m * math.prod(range(1, 2 * m, 2)) + 0 * z]  # of degrees m - 1 and m
         for n in range(m, degree + 1):
             norm = (2 if m else 1) * (2 * n + 1) / (4 * math.pi) * math.factorial(n - m) / math.factorial(n + m)
-            found[n, m], found[n, -m] = (
-                math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine)
-            )
+            found[n, m], found[n, -m] = (math.sqrt(norm) * legendre[1] * part for part in (cosine, sine if m else cosine))
             legendre = [legendre[1], ((2 * n + 1) * z * legendre[1] - (n + m) * legendre[0]) / (n + 1 - m)]
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
     return jnp.stack([found[n, m] for n in range(1, degree + 1) for m in range(-n, n + 1)], axis=-1)

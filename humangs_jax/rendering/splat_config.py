@@ -173,9 +173,7 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
 
     It is returned as it is where it has none of the other conventions: other knobs are the user's.
     """
-    wanted, other = (
-        SPLAT_PRESETS[name] for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact"))
-    )
+    wanted, other = (SPLAT_PRESETS[name] for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact")))
     if all(getattr(config, name) != getattr(other, name) for name in ("jacobian_margin", "normalize_quats", "square")):
         return config
     names = [field.name for field in dataclasses.fields(config)]

@@ -237,9 +237,7 @@ def _own_in_batch(size: int, batched: Sequence[bool], array: Array, of: Array) -
 # One image -----------------------------------------------------------------------------------------------------------
 
 
-def with_background(
-    gaussians: Gaussians, cameras: Camera, background: Background
-) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
+def with_background(gaussians: Gaussians, cameras: Camera, background: Background) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
     """What is drawn, in float32 at least. Raises: ValueError for a background that is no color."""
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 

@@ -386,9 +386,7 @@ def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], 
     return Squares(p.x, p.y, radius)
 
 
-def footprints_by(
-    projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
-) -> Footprints | Squares:
+def footprints_by(projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig) -> Footprints | Squares:
     """The footprints that a configuration asks for: ellipses that end at `alpha_min` or `radius_sigma`, or squares."""
     reach = squared_reach(opacities, config.alpha_min)
     reach = jnp.where(opacities >= config.opacity_min, reach, 0.0)

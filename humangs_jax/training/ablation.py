@@ -61,13 +61,10 @@ class Ablation:
     def __str__(self) -> str:
         head = ["variant", "seeds", self.metric, "difference", f"{CONFIDENCE:.0%} interval"]
         cells = [
-            [row.name, str(row.seeds), f"{row.mean:.2f}", *(_shown(row) if row.name != BASE else ("", ""))]
-            for row in self.rows
+            [row.name, str(row.seeds), f"{row.mean:.2f}", *(_shown(row) if row.name != BASE else ("", ""))] for row in self.rows
         ]
         lines = text_table([head, *cells])
-        return "\n".join(
-            [*lines, f"{self.missing} runs are missing: the budget was used up"][: len(lines) + bool(self.missing)]
-        )
+        return "\n".join([*lines, f"{self.missing} runs are missing: the budget was used up"][: len(lines) + bool(self.missing)])
 
     def plot(self) -> Any:
         """Differences to the base with their intervals; gray where the interval contains 0.

@@ -135,9 +135,7 @@ class Checkpoints:
         state, problem = None, ""
         try:
             with reading(path, "checkpoint"):
-                described = self._ocp.StandardCheckpointHandler().metadata(
-                    self._manager.directory / str(step) / "default"
-                )
+                described = self._ocp.StandardCheckpointHandler().metadata(self._manager.directory / str(step) / "default")
                 shapes = sorted(x.shape for x in jax.tree.leaves(getattr(described, "tree", described)))
                 if shapes != sorted(x.shape for x in jax.tree.leaves(wanted)):
                     raise Refused("its arrays are those of another model")

@@ -190,12 +190,8 @@ class Diagnosis:
         )
 
     def __str__(self) -> str:
-        title = (
-            f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
-        )
-        rows = [
-            ("stage", "values: bad", "smallest", "largest", "mean |x|", "sent back: bad", "parameters: bad", "norm")
-        ]
+        title = f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
+        rows = [("stage", "values: bad", "smallest", "largest", "mean |x|", "sent back: bad", "parameters: bad", "norm")]
         for report in (*self.stored, *self.stages):
             values, sent, own = (list(x.values()) for x in (report.values, report.taken, report.gradients))
             bad = lambda leaves: str(sum(leaf.bad for leaf in leaves)) if leaves else ""

@@ -120,9 +120,7 @@ def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
     return jnp.ones((*targets.translations.shape[:-1], 3), targets.images.dtype)
 
 
-def predict(
-    variables: Variables, body: BodyModel, example: Example, config: TrainConfig
-) -> tuple[Drawn, HumanGSOutputs]:
+def predict(variables: Variables, body: BodyModel, example: Example, config: TrainConfig) -> tuple[Drawn, HumanGSOutputs]:
     """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
     white = white_backgrounds(example.targets)

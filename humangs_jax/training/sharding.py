@@ -117,9 +117,7 @@ def mean_parts(gradients: PyTree, specs: PyTree, mesh: Mesh) -> PyTree:
     return jax.tree.map(one, gradients, specs)
 
 
-def join_processes(
-    coordinator: str | None = None, process_count: int | None = None, process_index: int | None = None
-) -> None:
+def join_processes(coordinator: str | None = None, process_count: int | None = None, process_index: int | None = None) -> None:
     """Become one of several processes; call it before anything else asks for devices.
 
     Arguments: coordinator "host:port" of process 0, how many processes, which of them this is. All None: as the cluster

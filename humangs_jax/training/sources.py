@@ -44,9 +44,7 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
 def check_example(example: Example, name: str) -> None:
     """Raises: ValueError, one line that begins with the name, unless all numbers are finite, colors and masks in [0, 1]."""
     kinds = {"images": UNIT, "masks": UNIT}
-    arrays = {
-        path: (np.asarray(leaf), kinds.get(path.split(".")[-1], FINITE)) for path, leaf in inexact_leaves(example)
-    }
+    arrays = {path: (np.asarray(leaf), kinds.get(path.split(".")[-1], FINITE)) for path, leaf in inexact_leaves(example)}
     check_values(name, arrays)
 
 

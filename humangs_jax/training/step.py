@@ -116,9 +116,7 @@ def local_gradients(
 
     def microbatch_loss(params, batch, keys):
         names = (SUBJECTS, *axes) if size > 1 else axes
-        one = lambda example, key: subject_loss(
-            params, batch_stats, body, example, key, config, networks, names or None
-        )
+        one = lambda example, key: subject_loss(params, batch_stats, body, example, key, config, networks, names or None)
         if size == 1:  # without vmap: a CPU runs the loops of a single subject faster
             first = lambda tree: jax.tree.map(lambda x: x[0], tree)
             loss, aux = one(first(batch), keys[0])

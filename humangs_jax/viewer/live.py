@@ -57,9 +57,7 @@ class LiveView:
         """Show an avatar in place of the last one, and a line above it. May be called from any thread."""
         self.pages["/avatar"] = page_html(avatar, self.motion)
         self.shown += 1
-        self.say(
-            f"{len(avatar.gaussians.means):,} Gaussians, {time.strftime('%H:%M:%S')}" if status is None else status
-        )
+        self.say(f"{len(avatar.gaussians.means):,} Gaussians, {time.strftime('%H:%M:%S')}" if status is None else status)
 
     def say(self, status: str) -> None:
         """Show a line above the avatar."""

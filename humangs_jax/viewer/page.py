@@ -74,9 +74,7 @@ class Packed:
     data: bytes
 
 
-def pack(
-    avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = None, motion_name: str = "motion"
-) -> Packed:
+def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = None, motion_name: str = "motion") -> Packed:
     """What the page holds of an avatar.
 
     Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of, for sliders of its shape.
@@ -84,9 +82,7 @@ def pack(
     Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other joints, or a body that
     does not explain the avatar's vertices.
     """
-    check_values(
-        "the page", gaussian_values(avatar.gaussians) | light_values(avatar.light) | _other_values(avatar, motion)
-    )
+    check_values("the page", gaussian_values(avatar.gaussians) | light_values(avatar.light) | _other_values(avatar, motion))
     joints = len(avatar.parents)
     if joints > 256:
         raise ValueError(f"the page draws avatars of up to 256 joints, got {joints}")
@@ -201,16 +197,12 @@ def _pack_shape(avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays:
     directions = np.moveaxis(np.asarray(body.shape_directions, np.float64), -1, 0)
     step = max(SHAPE_STEP, float(np.abs(directions).max()) / 32767)
     arrays["shape_directions"] = np.rint(directions / step).astype("<i2")
-    arrays["shape_joints"] = np.einsum("jn,sna->sja", np.asarray(body.joint_regressor, np.float64), directions).astype(
-        "<f4"
-    )
+    arrays["shape_joints"] = np.einsum("jn,sna->sja", np.asarray(body.joint_regressor, np.float64), directions).astype("<f4")
     names = body.shape_names or tuple(f"shape {i + 1}" for i in range(len(directions)))
     header["shape"] = {"names": names, "betas": betas.tolist(), "step": step}
 
 
-def _quantized(
-    values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
-) -> tuple[dict[str, Any], np.ndarray]:
+def _quantized(values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> tuple[dict[str, Any], np.ndarray]:
     low, high = np.asarray(low), np.maximum(high, np.asarray(low) + SMALLEST_RANGE)
     whole = np.rint((values - low) / (high - low) * STEPS).astype("<u2")
     return {"low": low.tolist(), "high": high.tolist()}, whole
@@ -237,9 +229,7 @@ LARGEST_FPS = 60.0
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
-def page_html(
-    avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None
-) -> str:
+def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None) -> str:
     """The page as text.
 
     Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown

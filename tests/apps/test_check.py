@@ -153,25 +153,19 @@ def test_warnings_tell_what_is_wrong(tmp_path):
 def test_photos_are_shrunk_and_cameras_with_them(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "LONGEST_SIDE", SIZE // 2)
     report = check_capture(capture(), tmp_path / "check.png")
-    assert (
-        report.ok and min(view.iou for view in report.views) > 0.7
-    )  # arms are 2 pixels thick then; a wrong scale leaves 0.3
+    assert report.ok and min(view.iou for view in report.views) > 0.7  # arms are 2 pixels thick then; a wrong scale leaves 0.3
     sheet, _ = read_image(tmp_path / "check.png")
     assert sheet.shape[1] < 2 * SIZE
 
 
 def test_each_view_shows_its_own_frame(tmp_path):
     moved = np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    report = check_capture(
-        capture(rotations=np.zeros((2, 3, 3)), translations=moved, frames=[0, 1, 0]), tmp_path / "check.png"
-    )
+    report = check_capture(capture(rotations=np.zeros((2, 3, 3)), translations=moved, frames=[0, 1, 0]), tmp_path / "check.png")
     assert [not view.warnings for view in report.views] == [True, False, True]
 
 
 def test_report_is_a_table():
-    report = module.CheckReport(
-        (ViewCheck("front", 0.5, 0.01, 0.25, ("too small",)), ViewCheck("left-side", None, None, 1.0))
-    )
+    report = module.CheckReport((ViewCheck("front", 0.5, 0.01, 0.25, ("too small",)), ViewCheck("left-side", None, None, 1.0)))
     header, front, left, warning = str(report).splitlines()
     assert header.split() == ["view", "silhouette", "IoU", "body", "outside", "mask", "body", "in", "frame"]
     assert front.split() == ["front", "0.500", "1.0%", "25%", "!"] and left.split() == [

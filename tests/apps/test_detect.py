@@ -77,9 +77,7 @@ def test_without_cameras_colors_tell_large_people_apart():
 
 def test_people_of_one_color_are_not_mixed_in_silence(tmp_path):
     photos = same_people([colored("a", 0.9, 0.1), colored("b", 0.5, 0.5), colored("c", 0.9, 0.2)])
-    with pytest.raises(
-        ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colors do not tell"
-    ):
+    with pytest.raises(ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colors do not tell"):
         detect.chosen(photos, 1, tmp_path)
     assert (tmp_path / "people.png").is_file()
 

@@ -156,9 +156,7 @@ def detected(mine, monkeypatch):
         person = SeenPerson(np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0)
         mask = to_uint8(capture.masks[v])
         bystander = Found(person, mask[:60, :20], (0, 0), 2e5)  # larger, but nobody's masks or keypoints are there
-        shown.append(
-            PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5)))
-        )
+        shown.append(PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5))))
 
     def stop(self, material, one_moment=None):
         told.append(material)
@@ -195,22 +193,16 @@ def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, mon
 
     truth, shown = load_capture("demo_capture"), detect.found_in_capture("me")
     named = lambda folder: [
-        dataclasses.replace(each, name=f"{name}.png")
-        for each, name in zip(shown, load_photos(folder).names, strict=True)
+        dataclasses.replace(each, name=f"{name}.png") for each, name in zip(shown, load_photos(folder).names, strict=True)
     ]
     monkeypatch.setattr(detect, "found_in_capture", named)
     cameras = ["import", "cameras", str(mine / "calibration.json"), "--images", str(mine / "images"), "--out", "me"]
     monkeypatch.setattr(fit_capture, "fit_photos", fit)
     assert cli.execute(cameras) == 0 and load_photos("me").masks is None
-    assert (
-        cli.execute(["fit", "me"]) == cli.BAD_DATA
-        and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
-    )
+    assert cli.execute(["fit", "me"]) == cli.BAD_DATA and "Person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
     assert cli.execute(["fit", "me", "--person", "1"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert (
-        err.endswith("error: the fit\n") and "keypoints and masks found in the photos: me/people.png shows them" in out
-    )
+    assert err.endswith("error: the fit\n") and "keypoints and masks found in the photos: me/people.png shows them" in out
     ((photos, keypoints),) = given
     np.testing.assert_allclose(photos.masks, truth.masks, atol=1 / 255)
     np.testing.assert_allclose(keypoints.points, np.nan_to_num(landmarks_in(truth, MEDIAPIPE_33.names)), atol=1e-3)
@@ -232,9 +224,8 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected,
     for name in ("masks", "keypoints"):
         shutil.rmtree(mine / name)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
-    assert (
-        "2 people in 0_00.png, 0_01.png, 0_02.png, 0_03.png: expected one. Person 0 to 1: numbers on me/people.png"
-        in (capsys.readouterr().err)
+    assert "2 people in 0_00.png, 0_01.png, 0_02.png, 0_03.png: expected one. Person 0 to 1: numbers on me/people.png" in (
+        capsys.readouterr().err
     )
     assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None
 
@@ -271,12 +262,7 @@ def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypa
     found = photos_alone._reduced(folders[0], files, folders[1])
     assert [str(file.relative_to(folders[1])) for file in found] == ["left/a.png", "b.png"]
     first, second = (read_image(file)[0][..., 0] for file in found)
-    assert (
-        first.shape == (40, 80)
-        and second.shape == (80, 40)
-        and first[0, -1] == 1
-        and second[-1, 0] > 0.9 > 0.1 > second[0, 0]
-    )
+    assert first.shape == (40, 80) and second.shape == (80, 40) and first[0, -1] == 1 and second[-1, 0] > 0.9 > 0.1 > second[0, 0]
     shutil.copy(files[0], folders[0] / "b.png")  # of the same name, but for the suffix
     assert photos_alone._reduced(folders[0], [*files, folders[0] / "b.png"], folders[1]) == []
 

@@ -108,18 +108,12 @@ def searched(front, machine, budget):
 
 
 @given(fronts(), shares, shares, shares, st.floats(1, 3000), st.floats(1, 3000), st.floats(10, 2000))
-def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(
-    front, make, refine, frame, most, each, memory
-):
+def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(front, make, refine, frame, most, each, memory):
     machine = lambda p: Cost(100 * make * p.make, 100 * refine * p.refine, 10 * frame * p.frame, p.memory_mb)
     budget = Budget(most, each, memory)
     for point in front:  # where a point is at the edge of the budget, rounding decides
         cost = machine(point)
-        assume(
-            all(
-                abs(a / b - 1) > 1e-6 for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))
-            )
-        )
+        assume(all(abs(a / b - 1) > 1e-6 for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))))
         assume(abs(cost.memory_mb / memory - 1) > 1e-6)
     allowed = [point for point in front if budget.allows(machine(point))]
     found, measured = searched(front, machine, budget)
@@ -140,8 +134,7 @@ def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front
 
 def test_a_choice_that_is_slower_the_second_time_is_not_taken(monkeypatch):
     fast, good = (
-        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q)
-        for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
+        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q) for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
     )
     times = {1: [30.0, 31.0], 2: [70.0, 90.0]}
     measure = lambda settings, *_: Cost(times[settings.views].pop(0), 0.0, 10.0, None)
@@ -164,9 +157,7 @@ def test_costs_are_extrapolated_from_the_nearest_measured_point():
 
 
 def test_what_is_given_up_is_said():
-    low, best = (
-        FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2) for n, q in (("low", 20.0), ("best", 26.5))
-    )
+    low, best = (FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2) for n, q in (("low", 20.0), ("best", 26.5)))
     text = in_words(tuning.Tuned(low, Cost(210.0, 0.0, 12.5, 300.0), {}), best)
     assert "2 photos" in text and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
     assert "gives up 6.5 dB in the pose of the photos and 6.5 dB in novel poses against 'best'" in text
@@ -220,13 +211,9 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     small = Runtime(image_size=32)
     front = [
         FrontPoint("one photo", Settings(views=1, runtime=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
-        FrontPoint(
-            "refined", Settings(runtime=small, refine_iterations=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0
-        ),
+        FrontPoint("refined", Settings(runtime=small, refine_iterations=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0),
     ]
-    assert (
-        tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front).point.name == "refined"
-    )
+    assert tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32, front=front).point.name == "refined"
     monkeypatch.setattr(tuning, "load_front", lambda: front)
     command = ("tune", "someone", "--weights", "tiny.safetensors", "--size", "32", "--out", "tuned.json")
 

@@ -91,9 +91,7 @@ def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
         monkeypatch, capsys, "animate", "avatar.npz", "--motion", "motion.npz", "--out", "frames", *small,
         "--background", "transparent", "--start", "0.5", "--fps", "6", "--loop", "2", "--prune",
     )  # fmt: skip
-    assert (
-        code == 0 and " of 324 Gaussians are in no image\nframes: 6 frames of 40 x 64 at 6 frames per second" in printed
-    ), error
+    assert code == 0 and " of 324 Gaussians are in no image\nframes: 6 frames of 40 x 64 at 6 frames per second" in printed, error
     image, alpha = read_image("frames/frame_00005.png")
     assert image.shape == (64, 40, 3) and alpha.max() > 0.9 and alpha.min() == 0 and len(os.listdir("frames")) == 6
     rows = np.flatnonzero(alpha.max(axis=1) > 0.5)
@@ -102,9 +100,7 @@ def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
     code, printed, error = run(
         monkeypatch, capsys, "render", "avatar.npz", "--out", "turn.webm", "--views", "5", *small, "--pose", "a"
     )
-    assert (
-        code == 0 and "Gaussians are in no image" not in printed and "turn.webm: 5 frames of 40 x 64 at 24" in printed
-    ), error
+    assert code == 0 and "Gaussians are in no image" not in printed and "turn.webm: 5 frames of 40 x 64 at 24" in printed, error
     assert (folder / "turn.webm").stat().st_size > 500
 
     more = ("--exr", "--channels", "rgba,z,position", "--exr-type", "half", "--views", "2", "--background", "#000")

@@ -85,12 +85,8 @@ class Case:
             skinning_joints=JOINTS if self.bare else None,
         )
         model = model.with_parts(
-            encoder=dataclasses.replace(
-                encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler
-            ),
-            reader=dataclasses.replace(
-                reader, output_width=None if self.bare else reader.output_width, sample_rgb=not published
-            ),
+            encoder=dataclasses.replace(encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler),
+            reader=dataclasses.replace(reader, output_width=None if self.bare else reader.output_width, sample_rgb=not published),
             decoder=decoder,
         )
         model = model.with_conventions(

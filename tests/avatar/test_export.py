@@ -44,9 +44,7 @@ SPZ_LOSSES = {**{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255}, "SH_DE
 """What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have twice."""
 TOOLS = Path(os.environ.get("HUMANGS_NPM", "."))
 """Folder where `npm install @playcanvas/splat-transform` was run; the environment variable HUMANGS_NPM."""
-TRANSFORM = shutil.which(
-    "splat-transform", path=f"{TOOLS / 'node_modules' / '.bin'}{os.pathsep}{os.environ.get('PATH', '')}"
-)
+TRANSFORM = shutil.which("splat-transform", path=f"{TOOLS / 'node_modules' / '.bin'}{os.pathsep}{os.environ.get('PATH', '')}")
 
 
 def person(seed=0, g=20):
@@ -165,9 +163,7 @@ def test_frames_are_named_as_python_names_them():
 
 def test_the_lowest_gaussian_that_is_seen_stands_on_the_floor():
     gaussians = person()
-    gaussians = replace(
-        gaussians, opacities=gaussians.opacities.at[0].set(0.01), means=gaussians.means.at[0, 1].set(-9.0)
-    )
+    gaussians = replace(gaussians, opacities=gaussians.opacities.at[0].set(0.01), means=gaussians.means.at[0, 1].set(-9.0))
     moved = grounded_gaussians(gaussians)
     seen = np.asarray(gaussians.opacities) >= 0.5
     assert np.asarray(moved.means)[seen, 1].min() == pytest.approx(0, abs=1e-6)
@@ -242,9 +238,7 @@ def test_glb_holds_the_attributes_of_the_extension(tmp_path):
     np.testing.assert_allclose(back.colors, gaussians.colors, atol=1e-6)
     fallback = arrays["COLOR_0"]
     np.testing.assert_allclose(fallback[:, 3], gaussians.opacities, atol=1e-6)
-    encoded = np.where(
-        fallback[:, :3] <= 0.0031308, 12.92 * fallback[:, :3], 1.055 * fallback[:, :3] ** (1 / 2.4) - 0.055
-    )
+    encoded = np.where(fallback[:, :3] <= 0.0031308, 12.92 * fallback[:, :3], 1.055 * fallback[:, :3] ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(encoded, gaussians.colors, atol=1e-6)  # glTF's colors of vertices are linear
 
 
@@ -410,9 +404,7 @@ def transformed(source, target):
     assert done.returncode == 0, done.stderr + done.stdout
 
 
-needs_npm = pytest.mark.skipif(
-    TRANSFORM is None, reason="needs npm's @playcanvas/splat-transform (HUMANGS_NPM: its folder)"
-)
+needs_npm = pytest.mark.skipif(TRANSFORM is None, reason="needs npm's @playcanvas/splat-transform (HUMANGS_NPM: its folder)")
 
 
 def _covariances(xyzw, scales):

@@ -192,9 +192,7 @@ def test_numbers_of_turns_never_jump_between_frames(tmp_path):
     angles = (np.linspace(0, 4 * np.pi, 25) + np.pi) % (2 * np.pi) - np.pi
     rotations = np.zeros((25, 55, 3))
     rotations[:, 0, 1], rotations[:, 3, 0] = angles, -angles
-    write_mesh_glb(
-        tmp_path / "a.glb", avatar(), mesh(), Motion(jnp.asarray(rotations, jnp.float32), jnp.zeros((25, 3)))
-    )
+    write_mesh_glb(tmp_path / "a.glb", avatar(), mesh(), Motion(jnp.asarray(rotations, jnp.float32), jnp.zeros((25, 3))))
     content, binary = parse_glb((tmp_path / "a.glb").read_bytes())
     tracks = [x for x in content["animations"][0]["channels"] if x["target"]["path"] == "rotation"]
     assert len(tracks) == 2

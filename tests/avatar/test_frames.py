@@ -75,9 +75,7 @@ def walker(metres=3.0, frames_per_second=30, seconds=3.0):
     """A box 1.7 m high that walks along x, bobbing and swaying at the pace of steps."""
     count = int(seconds * frames_per_second)
     time = np.arange(count) / frames_per_second
-    path = np.stack(
-        [metres * time / seconds, 0.03 * np.sin(4 * np.pi * time), 0.05 * np.sin(2 * np.pi * time)], axis=-1
-    )
+    path = np.stack([metres * time / seconds, 0.03 * np.sin(4 * np.pi * time), 0.05 * np.sin(2 * np.pi * time)], axis=-1)
     box = np.stack(np.meshgrid([-0.3, 0.3], [0, 1.7], [-0.2, 0.2]), axis=-1).reshape(-1, 3)
     return path[:, None] + box
 
@@ -112,9 +110,7 @@ def test_the_camera_goes_along_and_does_not_bob():
     assert np.abs(middle[:, 0] - 50).max() < 3  # in the middle of the image, at the ends of the walk, too
     eyes = np.asarray(cameras.center)
     np.testing.assert_allclose(np.diff(eyes[:, 0]), 3.0 / 90, rtol=1e-2)
-    assert (
-        np.ptp(eyes[:, 1]) < 0.25 * 0.06
-    )  # the head moves by 0.06; at the ends the path is mirrored at a point of that
+    assert np.ptp(eyes[:, 1]) < 0.25 * 0.06  # the head moves by 0.06; at the ends the path is mirrored at a point of that
 
 
 def test_distance_and_angles_are_those_that_are_asked_for():
@@ -259,9 +255,7 @@ def test_a_shot_that_cannot_be_taken_is_named(message):
 
 
 def test_colors_have_names_and_numbers():
-    assert (
-        Shot().color() == (1, 1, 1) == Shot(background="#ffffff").color() == Shot(background="rgb(255,255,255)").color()
-    )
+    assert Shot().color() == (1, 1, 1) == Shot(background="#ffffff").color() == Shot(background="rgb(255,255,255)").color()
     assert Shot(background=" Transparent ").color() is None
     assert Shot(background="#336699").color() == (0.2, 0.4, 0.6)
     assert Shot(width=20).resolution == (20, 512) and Shot(size=9, height=5).resolution == (9, 5)

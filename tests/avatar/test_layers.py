@@ -94,9 +94,7 @@ def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
     """A compositing program shows what was rendered when it adds (1 - alpha) times the background."""
     avatar, shot = two_balls(1), Shot(width=3, height=1, background="#336699")
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
-    rendering = Rendering(
-        jnp.asarray(0.25 * alpha[..., None] * np.ones(3)), jnp.asarray(alpha), jnp.ones((1, 3)), jnp.int32(0)
-    )
+    rendering = Rendering(jnp.asarray(0.25 * alpha[..., None] * np.ones(3)), jnp.asarray(alpha), jnp.ones((1, 3)), jnp.int32(0))
     monkeypatch.setattr(layers, "draw", lambda *arguments: iter([rendering]))
     poses, cameras = frames.turntable_views(avatar, frames.rest_pose_of(avatar), 1, shot)
     for name in ("view_000.png", "view_007.png", "mine.png"):  # the second is of an earlier call
@@ -124,9 +122,7 @@ def test_layers_of_the_two_balls(tmp_path):
     views = read_exr(tmp_path / "views.exr")
     for view, centres, camera in zip(views, (CENTRES, posed_centres()), cameras, strict=True):
         assert view.attributes["parts"].split(",") == list(NAMES)
-        position, normal = (
-            np.stack([view.channels[f"{kind}.{axis}"] for axis in "XYZ"], -1) for kind in ("position", "normal")
-        )
+        position, normal = (np.stack([view.channels[f"{kind}.{axis}"] for axis in "XYZ"], -1) for kind in ("position", "normal"))
         eye, rays = np.asarray(camera.center), layers.unprojected(camera, np.ones((96, 72), np.float32))
         rays = rays - eye
         along = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -170,7 +166,5 @@ def test_what_no_frame_shows_can_be_left_out():
     less = frames.without_unseen(avatar, poses, cameras, how)
     kept = len(less.gaussians.means)
     assert kept < 1.2 * n and less.skinning_weights.shape == (kept, 3)
-    for whole, part in zip(
-        frames.images(avatar, poses, cameras, shot), frames.images(less, poses, cameras, shot), strict=True
-    ):
+    for whole, part in zip(frames.images(avatar, poses, cameras, shot), frames.images(less, poses, cameras, shot), strict=True):
         assert np.abs(whole - part).max() < 2 / 255

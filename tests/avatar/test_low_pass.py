@@ -31,9 +31,7 @@ def flat_avatar():
 def test_variances_grow_by_the_low_pass_and_back():
     avatar = flat_avatar()
     wide = with_low_pass(avatar, PIXEL)
-    grown = np.square(np.asarray(wide.gaussians.scales, np.float64)) - np.square(
-        avatar.gaussians.scales, dtype=np.float64
-    )
+    grown = np.square(np.asarray(wide.gaussians.scales, np.float64)) - np.square(avatar.gaussians.scales, dtype=np.float64)
     np.testing.assert_allclose(grown, (EPS2D - MIP_EPS2D) * PIXEL**2, rtol=ROUNDING)
     np.testing.assert_array_equal(wide.gaussians.low_pass, jnp.full_like(wide.gaussians.opacities, PIXEL))
     back = without_low_pass(wide)

@@ -256,9 +256,7 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     for view, (low, side) in enumerate(((np.asarray([-1, 9]), 18), (np.asarray([9, 18]), 31))):
         before, after = (np.asarray(project(c.cameras[view], point)[0]) for c in (photos, cut))
         np.testing.assert_allclose(after, (before - low) * 18 / side, atol=1e-3)
-    np.testing.assert_allclose(
-        cut.images[0, 16 - 9 : 20 - 9, 6 + 1 : 10 + 1].reshape(-1, 3), [[0.2, 0.4, 0.6]] * 16, atol=1e-6
-    )
+    np.testing.assert_allclose(cut.images[0, 16 - 9 : 20 - 9, 6 + 1 : 10 + 1].reshape(-1, 3), [[0.2, 0.4, 0.6]] * 16, atol=1e-6)
     specks = photos.masks.copy()
     specks[1, 0, 0] = 1  # of less than a half percent of the person
     np.testing.assert_array_equal(cropped(dataclasses.replace(photos, masks=specks), 18).images, cut.images)
@@ -455,15 +453,11 @@ def test_views_and_bodies_of_another_configuration_are_refused(body, network):
     variables, config = network
     config = config.with_conventions(body_vertices=300)
     made, views = gaussian_body(body, config), subject_views(0)
-    with pytest.raises(
-        ValueError, match=r"a body of 500 vertices that gaussian_body\(body, config\) has not made; .*stack"
-    ):
+    with pytest.raises(ValueError, match=r"a body of 500 vertices that gaussian_body\(body, config\) has not made; .*stack"):
         reconstruct_views(variables, config, body, views)
     with pytest.raises(ValueError, match="has not made"):
         reconstruct_views(variables, config, decimate(made, 200), views)
-    with pytest.raises(
-        ValueError, match=r"photos of 32 x 32, config wants 64 x 64; body, views, config = stack_captures"
-    ):
+    with pytest.raises(ValueError, match=r"photos of 32 x 32, config wants 64 x 64; body, views, config = stack_captures"):
         reconstruct_views(variables, config.with_runtime(image_size=64), made, views)
     with pytest.raises(ValueError, match=r"views\.images: expected shape \(v, h, w, 3\), got \(1, 2, 32, 32, 3\)"):
         reconstruct_views(variables, config, made, jax.tree.map(lambda x: x[None], views))

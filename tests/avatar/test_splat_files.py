@@ -58,9 +58,7 @@ def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
     hg.save_gaussians(again, back := hg.load_gaussians(path))
     assert_close(back, before, STEPS[suffix])
     assert_close(hg.load_gaussians(again), back, (2e-6, 0.01, 1e-6, 1e-6, 1e-6))
-    assert_close(
-        hg.load_gaussians(str(path.rename(tmp_path / ("c.splat" if suffix == ".splat" else "c.bin")))), back, [0] * 5
-    )
+    assert_close(hg.load_gaussians(str(path.rename(tmp_path / ("c.splat" if suffix == ".splat" else "c.bin")))), back, [0] * 5)
 
 
 def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
@@ -73,9 +71,7 @@ def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
 def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=False):
     """3DGS, as its authors' program lays it out."""
     g = gaussians
-    rest = (
-        np.zeros((len(g.means), 0)) if g.harmonics is None else np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
-    )
+    rest = np.zeros((len(g.means), 0)) if g.harmonics is None else np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
     columns = dict(zip("xyz", np.asarray(g.means).T, strict=True)) | {name: np.arange(20) for name in extra}
     columns |= {f"f_dc_{i}": (np.asarray(g.colors)[:, i] - 0.5) / C0 for i in range(3)}
     columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
@@ -132,10 +128,7 @@ def compressed_ply(gaussians, colors_bounded=True):
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {len(chunks)}"]
     header += [f"property float {name}" for name in bounds] + [f"element vertex {count}"]
     header += [f"property uint {name}" for name in names]
-    body = (
-        np.stack(list(bounds.values()), axis=1).astype("<f4").tobytes()
-        + np.stack(vertex, axis=1).astype("<u4").tobytes()
-    )
+    body = np.stack(list(bounds.values()), axis=1).astype("<f4").tobytes() + np.stack(vertex, axis=1).astype("<u4").tobytes()
     if g.harmonics is not None:
         rest = np.asarray(g.harmonics).swapaxes(1, 2).reshape(count, -1)
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
@@ -160,9 +153,7 @@ def spz(gaussians, version):
     byte = lambda x: np.clip(np.rint(x), 0, 255).astype("u1").tobytes()
     fixed = np.rint(np.asarray(g.means) * 2**bits).astype(int).reshape(-1).tolist()
     body = b"".join((n % 2**24).to_bytes(3, "little") for n in fixed) + byte(255 * np.asarray(g.opacities))
-    body += (
-        byte(255 * (0.15 * (np.asarray(g.colors) - 0.5) / C0 + 0.5)) + byte(16 * (np.log(g.scales) + 10)) + rotations
-    )
+    body += byte(255 * (0.15 * (np.asarray(g.colors) - 0.5) / C0 + 0.5)) + byte(16 * (np.log(g.scales) + 10)) + rotations
     body += byte(128 * np.asarray(g.harmonics) + 128) if k else b""
     return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 20, COUNTS.index(k), bits, 1, 0) + body)
 
@@ -184,9 +175,7 @@ def glb(gaussians, node=None, change=lambda content: None, short=False):
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
         binary += data
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[np.asarray(values).reshape(20, -1).shape[1]]
-        accessors.append(
-            {"bufferView": len(accessors), "componentType": 5122 if small else 5126, "count": 20, "type": kind}
-        )
+        accessors.append({"bufferView": len(accessors), "componentType": 5122 if small else 5126, "count": 20, "type": kind})
         accessors[-1] |= {"normalized": True} if small else {}
     about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     part = {"attributes": {name: i for i, name in enumerate(columns)}, "mode": 0, "extensions": {EXTENSION: about}}
@@ -239,9 +228,7 @@ def test_splat_is_read_by_its_suffix(tmp_path):
     g = scene()
     quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
     numbers = np.column_stack([g.means, g.scales]).astype("<f4")
-    bytes_ = np.clip(np.rint(np.column_stack([255 * g.colors, 255 * g.opacities, 128 * quats + 128])), 0, 255).astype(
-        "u1"
-    )
+    bytes_ = np.clip(np.rint(np.column_stack([255 * g.colors, 255 * g.opacities, 128 * quats + 128])), 0, 255).astype("u1")
     rows = b"".join(a.tobytes() + b.tobytes() for a, b in zip(numbers, bytes_, strict=True))
     (tmp_path / "a.SPLAT").write_bytes(rows)
     assert_close(hg.load_gaussians(tmp_path / "a.SPLAT"), g, STEPS[".splat"])

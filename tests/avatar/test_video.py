@@ -33,9 +33,7 @@ def ffmpeg(*arguments):
 
 def read_back(path, height=48, width=64):
     """By ffmpeg itself (imageio's reader leaves file handles open)."""
-    data = ffmpeg(
-        "-v", "error", "-i", path, "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"
-    ).stdout
+    data = ffmpeg("-v", "error", "-i", path, "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-").stdout
     return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3) / 255.0
 
 

@@ -102,9 +102,7 @@ def sphere(rings=12, radius=1.0, open_below=False):
     angles = np.linspace(0, np.pi, rings + 1)[1:-1]
     angles = angles[: len(angles) // 2 + 1] if open_below else angles
     turn = np.arange(columns) * 2 * np.pi / columns
-    grid = [
-        [[np.sin(a) * np.sin(t + 0.1 * a), np.cos(a), np.sin(a) * np.cos(t + 0.1 * a)] for t in turn] for a in angles
-    ]
+    grid = [[[np.sin(a) * np.sin(t + 0.1 * a), np.cos(a), np.sin(a) * np.cos(t + 0.1 * a)] for t in turn] for a in angles]
     vertices = np.concatenate([[[0, 1.0, 0]], np.reshape(grid, (-1, 3)), [[0, -1.0, 0]]])
     at = lambda r, c: 1 + r * columns + c % columns
     faces = [(0, at(0, c), at(0, c + 1)) for c in range(columns)]

@@ -40,9 +40,7 @@ def bent():
     return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
 
 
-@pytest.mark.parametrize(
-    ("joints", "turned"), [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))]
-)
+@pytest.mark.parametrize(("joints", "turned"), [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))])
 def test_a_place_is_beside_its_joint_and_turns_with_its_bones(body, bent, joints, turned):
     places = (Place("left_elbow", "left_elbow", (0.03, 0.02, 0.0), joints),)
     plain, moved = landmark_model(body, ("left_elbow", "nose")), landmark_model(body, ("left_elbow", "nose"), places)

@@ -129,9 +129,7 @@ def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
     knee = posed(body, right_knee=(np.pi / 2, 0, 0))
     assert knee.joints[8, 2] < joints["right_knee"][2] - 0.3  # the heel goes back
     arms = posed(body, left_shoulder=(0, 0, -1.2), right_shoulder=(0, 0, 1.2))
-    assert (
-        arms.joints[20, 1] < joints["left_shoulder"][1] - 0.3 and arms.joints[21, 1] < joints["left_shoulder"][1] - 0.3
-    )
+    assert arms.joints[20, 1] < joints["left_shoulder"][1] - 0.3 and arms.joints[21, 1] < joints["left_shoulder"][1] - 0.3
     turned = posed(body, head=(0, 0.8, 0))
     nose = int(np.argmax(_face_front(body)))
     assert turned.vertices[nose, 0] > 0.04  # towards the person's left

@@ -90,10 +90,7 @@ def test_gradients_at_the_zero_pose_are_finite_and_right():
             assert np.isfinite(gradient).all()
             direction = jnp.asarray(np.random.default_rng(1).normal(size=at.shape))
             step = 1e-5
-            ends = [
-                [x + (s * step * direction if i == index else 0) for i, x in enumerate((betas, rotations))]
-                for s in (1, -1)
-            ]
+            ends = [[x + (s * step * direction if i == index else 0) for i, x in enumerate((betas, rotations))] for s in (1, -1)]
             numeric = (loss(*ends[0]) - loss(*ends[1])) / (2 * step)
             assert np.isclose(jnp.sum(gradient * direction), numeric, rtol=1e-7)
 

@@ -17,9 +17,7 @@ joint_transforms = jax.jit(model.joint_transforms, static_argnums=1)
 
 def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
     count = len(PARENTS)
-    above = lambda j, steps: (
-        j if j == count or not steps else above(PARENTS[j] if PARENTS[j] >= 0 else count, steps - 1)
-    )
+    above = lambda j, steps: j if j == count or not steps else above(PARENTS[j] if PARENTS[j] >= 0 else count, steps - 1)
     iterations = model.ancestors(PARENTS)
     for i, up in enumerate(iterations):
         assert list(up) == [above(j, 2**i) for j in range(count)]

@@ -167,9 +167,7 @@ def chumpy_pickle(path, content, wrap):
 def test_a_pickle_with_sparse_and_chumpy_arrays_is_the_same_model(tmp_path, sparse):
     arrays = made_up_file()
     np.savez(tmp_path / "model.npz", **arrays)
-    chumpy_pickle(
-        tmp_path / "model.pkl", {**arrays, "J_regressor": sparse(arrays["J_regressor"])}, ("v_template", "posedirs")
-    )
+    chumpy_pickle(tmp_path / "model.pkl", {**arrays, "J_regressor": sparse(arrays["J_regressor"])}, ("v_template", "posedirs"))
     one, other = load_smplx(tmp_path / "model.npz"), load_body(tmp_path / "model.pkl")
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         assert np.array_equal(a, b)
@@ -186,9 +184,7 @@ class Evil:
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_a_pickle_that_would_run_code_is_refused_by_name(tmp_path, protocol):
     marker = tmp_path / "was_here"
-    (tmp_path / "model.pkl").write_bytes(
-        pickle.dumps({**made_up_file(), "extra": Evil(str(marker))}, protocol=protocol)
-    )
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps({**made_up_file(), "extra": Evil(str(marker))}, protocol=protocol))
     with pytest.raises(ValueError, match=r"model\.pkl: refused to load (posix|nt)\.mkdir"):
         load_smplx(tmp_path / "model.pkl")
     assert not marker.exists()
@@ -287,7 +283,5 @@ def test_poses_assemble_under_vmap_and_jit():
     assert np.allclose(batch.rotations[2], assemble(numbers[2]).rotations, atol=ATOL)
     body = load_smplx(MODEL)
     rest = shape_body(body, jnp.zeros(1))
-    vertices = jax.jit(jax.vmap(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices))(
-        batch.rotations, batch.translation
-    )
+    vertices = jax.jit(jax.vmap(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices))(batch.rotations, batch.translation)
     assert vertices.shape == (4, 75, 3) and np.isfinite(vertices).all()

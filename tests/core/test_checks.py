@@ -22,9 +22,7 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras
 from humangs_jax.network.runtime import Runtime
 
 COUNT = 7
-GAUSSIANS = hg.Gaussians(
-    jnp.zeros((COUNT, 3)), jnp.ones((COUNT, 4)), jnp.ones((COUNT, 3)), jnp.ones(COUNT), jnp.ones((COUNT, 3))
-)
+GAUSSIANS = hg.Gaussians(jnp.zeros((COUNT, 3)), jnp.ones((COUNT, 4)), jnp.ones((COUNT, 3)), jnp.ones(COUNT), jnp.ones((COUNT, 3)))
 CAMERA = hg.Camera(jnp.eye(3), jnp.eye(4), 8, 8)
 POSE = hg.BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
 AVATAR = hg.Avatar(
@@ -275,9 +273,7 @@ def test_what_is_right_passes():
 def test_what_is_wrong_is_named(array_of, entries, values, words):
     right = (jnp.ones(3), FINITE)
     with pytest.raises(ValueError, match=f"^draw: colors: {words}$"):
-        check_values(
-            "draw", {"means": right, "colors": (array_of(np.asarray(entries, np.float32)), values), "w": right}
-        )
+        check_values("draw", {"means": right, "colors": (array_of(np.asarray(entries, np.float32)), values), "w": right})
 
 
 def test_traced_arrays_are_not_looked_at():

@@ -87,9 +87,7 @@ def test_a_process_that_is_started_deaf_survives_an_interrupt():
     for deaf in (True, False):
         if deaf:
             with started_deaf():
-                program = subprocess.Popen(
-                    [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-                )
+                program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         else:
             program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         ends[deaf] = program.communicate()[0]

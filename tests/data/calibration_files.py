@@ -58,9 +58,7 @@ def quaternion(rotation):
     """wxyz of the matrix, from its eigenvector."""
     w, v = np.linalg.eig(rotation)
     axis = np.real(v[:, np.argmin(np.abs(w - 1))])
-    off = np.asarray(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
+    off = np.asarray([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     angle = np.arctan2(axis @ off / 2, (np.trace(rotation) - 1) / 2)
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
 

@@ -101,9 +101,7 @@ def test_any_axis_can_be_up(tmp_path, up):
     report = import_cameras(source, images, tmp_path / "out", up=up)
     assert report.warnings == ()
     views = views_of(tmp_path / "out")
-    got, true = (
-        np.stack([p[:3, :3] for p in which]) for which in (np.asarray([v["cam_from_world"] for v in views]), poses)
-    )
+    got, true = (np.stack([p[:3, :3] for p in which]) for which in (np.asarray([v["cam_from_world"] for v in views]), poses))
     np.testing.assert_allclose(got[:, :, 1], true[:, :, 1], atol=1e-9)  # y is y; the heading is free
     relative = lambda r: r @ np.swapaxes(r[:1], 1, 2)
     np.testing.assert_allclose(relative(got), relative(true), atol=1e-9)
@@ -163,9 +161,7 @@ def test_colmap_points_are_reprojected(tmp_path):
     assert report.checks.reprojection is not None and report.checks.reprojection < 1e-9
     assert report.checks.observations == 4 * len(p)
     assert report.undistorted == 4 and "lens distortion removed from 4 photos" in str(report)
-    written.write_colmap(
-        tmp_path / "model", K, poses, names, "SIMPLE_RADIAL", [k1], [s + np.asarray([3, 0]) for s in seen], p
-    )
+    written.write_colmap(tmp_path / "model", K, poses, names, "SIMPLE_RADIAL", [k1], [s + np.asarray([3, 0]) for s in seen], p)
     report = import_cameras(tmp_path / "model", tmp_path / "photos", tmp_path / "out", up="+y", overwrite=True)
     assert report.checks.reprojection == pytest.approx(3)
     assert "mean reprojection error is 3 px" in report.warnings[0]

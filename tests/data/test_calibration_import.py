@@ -443,9 +443,7 @@ def test_masks_that_a_transforms_json_names_are_used(tmp_path, key):
     report = import_cameras(*source, masks=masks, up="+y", overwrite=True)
     assert report.warnings == (f"{key} of transforms.json: not used, the masks are those in {masks}",)
     (masks / "c.png").unlink()
-    with pytest.raises(
-        CaptureError, match=rf"images/c\.png: {key}: \./fg/c\.png: no such mask, but other images have one"
-    ):
+    with pytest.raises(CaptureError, match=rf"images/c\.png: {key}: \./fg/c\.png: no such mask, but other images have one"):
         import_cameras(*source, up="+y", overwrite=True)
 
 

@@ -41,9 +41,7 @@ def save(file, image, flag=1):
     Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(file, exif=exif)
 
 
-def phone(
-    tmp_path, flag, lens=0 * LENS, mask=None, calibrated="stored", size=(written.WIDTH, written.HEIGHT), **changes
-):
+def phone(tmp_path, flag, lens=0 * LENS, mask=None, calibrated="stored", size=(written.WIDTH, written.HEIGHT), **changes):
     """A rig whose photos have a flag, and its import. mask: "stored" or "shown", or "flagged" for stored with the flag."""
     K, poses = written.scene()
     K[:, 0, 2], K[:, 1, 2] = size[0] / 2 + 1.3, size[1] / 2 - 0.8
@@ -73,9 +71,7 @@ def check_agreement(folder):
     """The spot is where the capture's camera sees the point, in photo and mask; photos are read as written."""
     photos = load_photos(folder)
     for i, name in enumerate(json.loads((folder / "capture.json").read_text())["views"]):
-        expected = written.project(
-            np.asarray(photos.cameras.K[i]), np.asarray(photos.cameras.cam_from_world[i]), POINT[None]
-        )
+        expected = written.project(np.asarray(photos.cameras.K[i]), np.asarray(photos.cameras.cam_from_world[i]), POINT[None])
         image = photos.images[i, ..., 0] if photos.masks is None else photos.masks[i]
         np.testing.assert_allclose(centroid(image, expected[0]), expected[0], atol=OFF)
         assert orientation(folder / name["image"]) == 1
@@ -124,13 +120,9 @@ def test_square_photos_are_taken_as_stored_with_a_warning(tmp_path):
 
 
 def test_other_sizes_and_flags_are_refused(tmp_path):
-    with pytest.raises(
-        CaptureError, match=r"a\.png: size: 64 x 48 \(EXIF orientation 6\), was calibrated with 32 x 24"
-    ):
+    with pytest.raises(CaptureError, match=r"a\.png: size: 64 x 48 \(EXIF orientation 6\), was calibrated with 32 x 24"):
         phone(tmp_path, 6, imgSize=[32, 24])
-    with pytest.raises(
-        CaptureError, match=r"was calibrated with 48 x 64: .* turned \(an EXIF orientation that got lost\)"
-    ):
+    with pytest.raises(CaptureError, match=r"was calibrated with 48 x 64: .* turned \(an EXIF orientation that got lost\)"):
         phone(tmp_path, 1, imgSize=[48, 64])
     assert not (tmp_path / "me").exists()
 
@@ -161,17 +153,11 @@ def by_hand(tmp_path, turned_K):
 
 def test_captures_made_by_hand_are_warned_of_or_refused(tmp_path, caplog):
     load_photos(by_hand(tmp_path, turned_K=False))
-    assert [
-        record.getMessage()
-        for record in caplog.records
-        if "EXIF orientation of a.png and 3 more" in record.getMessage()
-    ]
+    assert [record.getMessage() for record in caplog.records if "EXIF orientation of a.png and 3 more" in record.getMessage()]
 
 
 def test_a_hand_made_K_of_the_turned_photo_is_refused(tmp_path):
-    with pytest.raises(
-        CaptureError, match=r"a\.png: orientation: EXIF orientation 6 is ignored, but K is of the turned photo"
-    ):
+    with pytest.raises(CaptureError, match=r"a\.png: orientation: EXIF orientation 6 is ignored, but K is of the turned photo"):
         load_photos(by_hand(tmp_path, turned_K=True))
 
 

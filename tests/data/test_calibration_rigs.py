@@ -113,9 +113,7 @@ def test_a_whole_K_of_a_frame_or_of_the_file(place, tmp_path):
         (frame if place == "frame" else values)["K"] = (k if place == "frame" else K[0]).tolist()
     (tmp_path / "transforms.json").write_text(json.dumps(values))
     found = read_calibration(tmp_path / "transforms.json", lambda name: SIZE)
-    np.testing.assert_allclose(
-        [camera.K for camera in found.cameras], K if place == "frame" else [K[0]] * 4, atol=EXACT
-    )
+    np.testing.assert_allclose([camera.K for camera in found.cameras], K if place == "frame" else [K[0]] * 4, atol=EXACT)
 
 
 def write_binary(folder, text):

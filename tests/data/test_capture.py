@@ -491,9 +491,7 @@ def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
     content = json.loads(description)
     assert set(content) == set(written) and set(content["views"][0]) == set(written["views"][0])
     for key in ("image", "mask"):
-        (tmp_path / "me" / content["views"][0][key]).write_bytes(
-            (tmp_path / "me" / written["views"][0][key]).read_bytes()
-        )
+        (tmp_path / "me" / content["views"][0][key]).write_bytes((tmp_path / "me" / written["views"][0][key]).read_bytes())
     Path("me/capture.json").write_text(description)
     np.testing.assert_array_equal(load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0])
     # the camera that the text describes: 2.6 m in front, 0.9 m above the ground

@@ -90,9 +90,7 @@ def test_a_coat_is_found(body, dressed):
 def test_the_inset_is_kept(body, dressed):
     capture, _ = dressed
     worn = free(body) > 0.99
-    near, deep = (
-        along_normals(body, capture, displacement(body, capture, (inset, inset)))[worn] for inset in (0.0, 0.004)
-    )
+    near, deep = (along_normals(body, capture, displacement(body, capture, (inset, inset)))[worn] for inset in (0.0, 0.004))
     assert np.median(near - deep) == pytest.approx(0.004, abs=FOUND / 2)
 
 
@@ -152,9 +150,7 @@ def test_the_border_of_a_photo_is_no_edge_of_the_person(body, dressed):
     capture, coat = dressed
     half = SIZE // 2
     cameras = replace(capture.cameras, height=half)
-    upper = dataclasses.replace(
-        capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras
-    )
+    upper = dataclasses.replace(capture, images=capture.images[:, :half], masks=capture.masks[:, :half], cameras=cameras)
     found, true = (along_normals(body, capture, x) for x in (displacement(body, upper, inset=(0.0, 0.0)), coat))
     errors = np.abs(found - true)
     assert np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND  # what no photo shows stays where it was

@@ -208,9 +208,7 @@ def test_faults_are_one_line_that_names_the_file(tmp_path, fault):
 
 def test_shares_of_the_image_are_no_pixels(tmp_path):
     body = np.stack([np.linspace(0.2, 0.8, 25), np.linspace(0, 1, 25), np.ones(25)], axis=1).reshape(-1).tolist()
-    with pytest.raises(
-        CaptureError, match=r"expected pixels, not shares of the image \(OpenPose: --keypoint_scale 0\)"
-    ):
+    with pytest.raises(CaptureError, match=r"expected pixels, not shares of the image \(OpenPose: --keypoint_scale 0\)"):
         read(tmp_path / "front_keypoints.json", {"people": [{"pose_keypoints_2d": body}]})
 
 

@@ -202,9 +202,7 @@ def test_coco_results_and_alphapose_by_name(tmp_path, keypoint_set, key):
 
 def test_coco_results_by_number(tmp_path):
     values = known(17)
-    entries = [
-        {"image_id": i, "keypoints": flat(each), "score": 0.9} for i, each in zip((7, 9, 4), values, strict=True)
-    ]
+    entries = [{"image_id": i, "keypoints": flat(each), "score": 0.9} for i, each in zip((7, 9, 4), values, strict=True)]
     check(read(write(tmp_path / "r.json", entries), ("000007", "000009", "a_04")), values, COCO_17)
 
 

@@ -10,9 +10,7 @@ from humangs_jax.data.keypoints.sets import (
 )
 
 
-@pytest.mark.parametrize(
-    "keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67), (MEDIAPIPE_33, 33)]
-)
+@pytest.mark.parametrize("keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67), (MEDIAPIPE_33, 33)])
 def test_names_are_different_and_mirrors_are_mutual(keypoint_set, count):
     assert len(keypoint_set.names) == len(set(keypoint_set.names)) == len(keypoint_set.mirror) == count
     assert KEYPOINT_SETS[keypoint_set.name] is keypoint_set

@@ -181,9 +181,7 @@ def test_nearest_view_wraps_around():
 def test_shrinking_averages_boxes():
     images = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 3)).astype(np.uint8)
     np.testing.assert_allclose(shrink(images, 2)[1, 0, 1], images[1, :4, 4:].mean(axis=(0, 1)) / 255, rtol=1e-5)
-    np.testing.assert_allclose(
-        shrink(images, 3)[..., 1].mean(axis=(1, 2)), images[..., 1].mean(axis=(1, 2)) / 255, rtol=1e-5
-    )
+    np.testing.assert_allclose(shrink(images, 3)[..., 1].mean(axis=(1, 2)), images[..., 1].mean(axis=(1, 2)) / 255, rtol=1e-5)
     np.testing.assert_array_equal(shrink(images, 8), images.astype(np.float32) / np.float32(255))
     assert shrink(images[:0], 2).shape == (0, 2, 2, 3)
     for wrong, size in ((images, 9), (images[:, :6], 3)):
@@ -329,9 +327,7 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
     assert "005.png: no such image file" in broken(lambda root: (root / "images" / "005.png").unlink())
     small = np.zeros((SIZE // 2, SIZE, 3), np.float32)
     assert "003.png: size: (16, 8), but the first" in broken(lambda root: write_png(root / "images" / "003.png", small))
-    assert "000.png: size: (16, 8), but its image" in broken(
-        lambda root: write_png(root / "masks" / "000.png", small[..., 0])
-    )
+    assert "000.png: size: (16, 8), but its image" in broken(lambda root: write_png(root / "masks" / "000.png", small[..., 0]))
     assert "views[4].frame: expected 0 to 1" in broken(edit(frame=2))
     assert "views[4].K: expected shape (3, 3)" in broken(edit(K=[1, 2]))
     assert "views[4]" in broken(edit(cam_from_world=np.zeros((4, 4)).tolist()))

@@ -113,10 +113,7 @@ def test_leaving_the_loop_ends_all_threads():
 def test_processes_together_make_the_batch_of_one(process_count, share, step):
     size = process_count * share
     whole = Loader(CountingSource(), size, seed=1)
-    parts = [
-        Loader(CountingSource(), size, seed=1, process_index=i, process_count=process_count)
-        for i in range(process_count)
-    ]
+    parts = [Loader(CountingSource(), size, seed=1, process_index=i, process_count=process_count) for i in range(process_count)]
     assert [row for part in parts for row in part.rows] == list(range(size))
     together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *[part.batch_at(step) for part in parts])
     assert same(together, whole.batch_at(step))

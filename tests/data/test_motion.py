@@ -43,9 +43,7 @@ def upright_poses(columns):
 
 
 def test_our_own_format_round_trips(tmp_path):
-    motion = Motion(
-        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3)), jnp.float32), 24.0
-    )
+    motion = Motion(jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3)), jnp.float32), 24.0)
     save_motion(tmp_path / "a.npz", motion)
     back = load_motion(tmp_path / "a.npz")
     jax.tree.map(np.testing.assert_array_equal, motion, back)  # fps is part of the structure
@@ -124,14 +122,10 @@ def test_lhm(tmp_path):
 def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """Known to the command's help and to `load_motion`, which finds the one of two formats that a file is by its content."""
     standing = lambda path, reading: Poses(np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text()))
-    monkeypatch.setitem(
-        MOTIONS, "toy", MotionFormat("made up", standing, (".toy", ".pkl"), lambda path: path.suffix == ".toy")
-    )
+    monkeypatch.setitem(MOTIONS, "toy", MotionFormat("made up", standing, (".toy", ".pkl"), lambda path: path.suffix == ".toy"))
     monkeypatch.setattr(animate, "Animate", animate.Animate)  # reloading replaces it
     importlib.reload(animate)
-    assert ".toy or .pkl: made up" in " ".join(
-        run(monkeypatch, capsys, "animate", "--help")[1].replace("│", " ").split()
-    )
+    assert ".toy or .pkl: made up" in " ".join(run(monkeypatch, capsys, "animate", "--help")[1].replace("│", " ").split())
     (tmp_path / "a.toy").write_text("25")
     assert load_motion(tmp_path / "a.toy").fps == 25.0
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(AIST))
@@ -208,10 +202,7 @@ def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
     motion = load_motion(write(tmp_path / "a.npz", **amass(*still)))
     assert motion.rotations[0, 0, 0] == pytest.approx(-np.pi / 2)
     (line,) = caplog.messages
-    assert (
-        line
-        == f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; if they should stand: up=y"
-    )
+    assert line == f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; if they should stand: up=y"
     caplog.clear()
     beat = amass(*still) | {"expressions": np.zeros((4, 100))}  # BEAT2's has y up
     assert not np.any(load_motion(write(tmp_path / "b.npz", **beat)).rotations) and not caplog.messages
@@ -223,9 +214,7 @@ def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
 def test_a_tilt_is_no_other_axis(tmp_path):
     tilted = np.zeros((4, 55, 3))
     tilted[:, 0, 0] = 0.8  # radians: nearer to z than to y
-    np.testing.assert_allclose(
-        load_motion(write(tmp_path / "a.npz", **parts(tilted, np.zeros((4, 3))))).rotations, tilted
-    )
+    np.testing.assert_allclose(load_motion(write(tmp_path / "a.npz", **parts(tilted, np.zeros((4, 3))))).rotations, tilted)
 
 
 def test_where_no_axis_is_clear_the_format_decides(tmp_path):
@@ -348,9 +337,7 @@ def rest_body():
 
 def test_grounded_stands_on_the_floor_at_the_origin():
     rest = rest_body()
-    motion = Motion(
-        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3), 3, 2.0), jnp.float32)
-    )
+    motion = Motion(jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3), 3, 2.0), jnp.float32))
     placed = grounded(motion, rest, PARENTS)
     shift = np.asarray(motion.translations - placed.translations)
     np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32)  # by a constant
@@ -374,9 +361,7 @@ def test_amass_adds_the_mean_hand_where_asked(tmp_path, columns):
     np.testing.assert_array_equal(mean[:, :75], flat[:, :75])
     added = np.broadcast_to(np.asarray(basis.means).ravel(), (FRAMES, 90))
     np.testing.assert_allclose(mean[:, 75:] - flat[:, 75:], added, atol=FLOAT32)
-    body = load_motion(
-        write(tmp_path / "b.npz", **(AMASS | {"poses": upright_poses(66)})), hands=basis, flat_hand_mean=False
-    )
+    body = load_motion(write(tmp_path / "b.npz", **(AMASS | {"poses": upright_poses(66)})), hands=basis, flat_hand_mean=False)
     assert not np.asarray(body.rotations)[:, 22:].any()  # no hands, nothing to add to
     with pytest.raises(MotionError, match="our own format holds whole rotations"):
         load_motion(write(tmp_path / "c.npz", **OURS), hands=basis, flat_hand_mean=False)
@@ -402,18 +387,14 @@ def test_at_rate_turns_at_an_even_speed():
     motion = Motion(jnp.asarray(vectors, jnp.float32), jnp.zeros((4, 3)), 30.0)
     fast = motion.at_rate(60)
     np.testing.assert_array_equal(fast.rotations[::2], motion.rotations)
-    wanted = quaternion.from_axis_angle(
-        jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32)
-    )
+    wanted = quaternion.from_axis_angle(jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32))
     got = quaternion.from_axis_angle(fast.rotations[:, 0])
     np.testing.assert_allclose(np.abs(np.sum(got * wanted, axis=-1)), 1, atol=FLOAT32)
 
 
 def test_motions_are_pytrees():
     motion = Motion(jnp.zeros((4, 2, 3)), jnp.ones((4, 3)), 24.0)
-    poses = jax.vmap(lambda rotations, translation: BodyPose(rotations, translation))(
-        motion.rotations, motion.translations
-    )
+    poses = jax.vmap(lambda rotations, translation: BodyPose(rotations, translation))(motion.rotations, motion.translations)
     assert poses.translation.shape == (4, 3)
     doubled = jax.jit(lambda m: jax.tree.map(lambda x: 2 * x, m))(motion)
     assert doubled.fps == 24.0 and float(doubled.translations.max()) == 2

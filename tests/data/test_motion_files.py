@@ -186,8 +186,7 @@ def easymocap(rotations=ROTATIONS, places=PLACES, root=None, number=0):
     th = places + PELVIS - turn.apply(PELVIS)
     rows = zip(turn.as_rotvec(), th, poses, strict=True)
     return [
-        {"id": number, "Rh": [r.tolist()], "Th": [t.tolist()], "poses": [p.tolist()], "shapes": [[0.0] * 10]}
-        for r, t, p in rows
+        {"id": number, "Rh": [r.tolist()], "Th": [t.tolist()], "poses": [p.tolist()], "shapes": [[0.0] * 10]} for r, t, p in rows
     ]
 
 
@@ -244,9 +243,7 @@ def smplerx(rotations=ROTATIONS, places=PLACES, number=0):
 
 
 def slahmr(people):
-    stacked = [
-        np.stack(x) for x in zip(*((r[:, 0], r[:, 1:22].reshape(len(r), -1), p) for r, p in people), strict=True)
-    ]
+    stacked = [np.stack(x) for x in zip(*((r[:, 0], r[:, 1:22].reshape(len(r), -1), p) for r, p in people), strict=True)]
     return npz(
         "a_world_results.npz",
         root_orient=stacked[0],
@@ -318,9 +315,7 @@ FILES = {
     "PHALP": (saved("demo.pkl", phalp(), lambda x: zlib.compress(joblib(x))), BODY, {"person": 3}),
     "EasyMocap": (texts([f"{i:06d}.json" for i in range(FRAMES)], [[x] for x in easymocap()]), BODY, {}),
     "EasyMocap, in smpl/": (
-        all_of(
-            in_folder("smpl", texts([f"{i:06d}.json" for i in range(FRAMES)], [{"annots": [x]} for x in easymocap()]))
-        ),
+        all_of(in_folder("smpl", texts([f"{i:06d}.json" for i in range(FRAMES)], [{"annots": [x]} for x in easymocap()]))),
         *(BODY, {}),
     ),
     "EasyMocap, own root": (
@@ -418,15 +413,10 @@ SEVERAL = {
     "PHALP": saved("a.pkl", phalp(0)),
     "EasyMocap": texts(
         [f"{i:06d}.json" for i in range(FRAMES)],
-        [
-            [x, *([y] if y else [])]
-            for x, y in zip(easymocap(), [*easymocap(OTHER, AWAY, number=7), None, None], strict=True)
-        ],
+        [[x, *([y] if y else [])] for x, y in zip(easymocap(), [*easymocap(OTHER, AWAY, number=7), None, None], strict=True)],
     ),
     "SMPLer-X": all_of(*smplerx(), *smplerx(OTHER, AWAY, number=7)),
-    "TRAM": lambda folder: all_of(*(in_folder("hps", objects(f"hps_track_{i}.npy", tram_values(i))) for i in (0, 7)))(
-        folder
-    ),
+    "TRAM": lambda folder: all_of(*(in_folder("hps", objects(f"hps_track_{i}.npy", tram_values(i))) for i in (0, 7)))(folder),
     "Human3R": human3r(((0, ROTATIONS, PLACES), (7, ROTATIONS[::-1], PLACES))),
 }
 

@@ -185,8 +185,7 @@ def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
     rotations, translations, _ = loaded(tmp_path, write_bvh(source, poses, names, frame, moves), rest_joints=target)
     ours = places_of(target, rotations, translations + target[0])
     legs = lambda rest: sum(
-        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]])
-        for a, b in (("hip", "knee"), ("knee", "ankle"))
+        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]]) for a, b in (("hip", "knee"), ("knee", "ankle"))
     )
     expected = np.where(np.arange(frames) == 4, 0.25 * legs(target) / legs(source), 0)
     feet = ours[:, [ankle, INDEX["right_ankle"]], 1]
@@ -217,9 +216,7 @@ def test_names_with_spaces(tmp_path, gap, brace):
     """As Biped and Rocketbox have them: a name ends with its line, or before a brace."""
     limbs = {"shoulder": "UpperArm", "elbow": "Forearm", "wrist": "Hand", "collar": "Clavicle"}
     limbs |= {"hip": "Thigh", "knee": "Calf", "ankle": "Foot", "foot": "Toe0"}
-    names = {
-        o: gap.join(["Bip01", o[0].upper(), limbs[o.split("_")[1]]] if "_" in o else ["Bip01", o.title()]) for o in CMU
-    }
+    names = {o: gap.join(["Bip01", o[0].upper(), limbs[o.split("_")[1]]] if "_" in o else ["Bip01", o.title()]) for o in CMU}
     rest, poses = person(), dance(3, names=CMU)
     text = "\n".join(line.strip(" \t") for line in write_bvh(rest, poses, names).splitlines()).replace("\n{", brace)
     for ending in ("\n", "\r\n"):
@@ -236,9 +233,7 @@ def test_few_spine_joints(tmp_path):
     np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
 
 
-HEAD = (
-    "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
-)
+HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
 BAD = {
     "words": ("hello", "not a BVH file: expected HIERARCHY first"),
     "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
@@ -306,9 +301,7 @@ def write_glb(
 
     def animate(node, path_, values):
         if interpolation == "CUBICSPLINE":
-            values = np.stack([np.zeros_like(values), values, np.zeros_like(values)], axis=1).reshape(
-                -1, values.shape[1]
-            )
+            values = np.stack([np.zeros_like(values), values, np.zeros_like(values)], axis=1).reshape(-1, values.shape[1])
         kind = {3: "VEC3", 4: "VEC4"}[values.shape[1]]
         samplers.append({"input": times, "output": writer.array(kind, values), "interpolation": interpolation})
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path_}})
@@ -467,8 +460,6 @@ def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_and_it
     poses, translations = motions()["walking"]
     turned, moved = in_world(poses, translations, UP["z"])
     with caplog.at_level(logging.WARNING):
-        rotations, _, _ = loaded(
-            tmp_path, write_bvh(person(), turned, CMU, moves=moved + person()[0]), rest_joints=person()
-        )
+        rotations, _, _ = loaded(tmp_path, write_bvh(person(), turned, CMU, moves=moved + person()[0]), rest_joints=person())
     np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
     assert "dance.bvh: z is up, not y as usual" in caplog.text

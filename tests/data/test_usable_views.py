@@ -110,7 +110,5 @@ def test_all_that_reads_photos_leaves_it_out(demo):
 def test_no_view_left_is_an_error_that_names_them(demo):
     nobody = dataclasses.replace(demo, masks=0 * demo.masks)
     for read in (usable_views, lambda c: select_views(c, 2), lambda c: standardize(c, 64), crop_to_person):
-        with pytest.raises(
-            CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"
-        ):
+        with pytest.raises(CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"):
             read(nobody)

@@ -87,9 +87,7 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
         both = (quality[far] > 0) & (quality[near] > 0)
         distance = matrices[near, 2, 3]
         # the rays of the nearer camera spread more, by some degrees
-        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(
-            distance / (distance + away), rel=0.1
-        )
+        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(distance / (distance + away), rel=0.1)
 
 
 def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):

@@ -119,9 +119,7 @@ PERSON, ROOM = np.asarray([0.7, 0.5, 0.4], np.float32), np.asarray([0.2, 0.3, 0.
 def scene(scale):
     """Photo, true coverage, and the mask of a network that has one pixel for `scale` of the photo; a body with a thin arm."""
     y, x = np.mgrid[: 60 * scale, : 60 * scale] / scale
-    true = ((np.hypot((x - 30) / 12, (y - 32) / 22) < 1) | ((np.abs(y - 20) < 1.2) & (x > 30) & (x < 54))).astype(
-        np.float32
-    )
+    true = ((np.hypot((x - 30) / 12, (y - 32) / 22) < 1) | ((np.abs(y - 20) < 1.2) & (x > 30) & (x < 54))).astype(np.float32)
     photo = PERSON * true[..., None] + ROOM * (1 - true[..., None])
     photo += 0.02 * np.random.default_rng(0).normal(size=photo.shape).astype(np.float32)
     coarse = ndimage.gaussian_filter(resized(true, 60, 60), 0.8)

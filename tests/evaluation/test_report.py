@@ -49,9 +49,7 @@ def column(browser, heading):
 
 
 def press(browser, heading):
-    browser.run(
-        "[...document.querySelectorAll('#images th button')].find((b) => b.textContent === given[0]).click()", heading
-    )
+    browser.run("[...document.querySelectorAll('#images th button')].find((b) => b.textContent === given[0]).click()", heading)
 
 
 def test_the_worst_comes_first_and_columns_sort(browser, found):
@@ -97,10 +95,7 @@ def test_one_person_alone_and_means_with_intervals(browser, found):
 
 
 def test_the_page_asks_for_nothing(browser):
-    assert (
-        browser.run("return performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length")
-        == 0
-    )
+    assert browser.run("return performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length") == 0
     with pytest.raises(RuntimeError, match="fetch"):
         browser.run("await fetch('http://127.0.0.1:1/')")
     assert len(browser.problems()) > 0  # the browser's own protest

@@ -62,9 +62,7 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
     files = {kind: tmp_path / f"a.{kind}" for kind in ("json", "html", "csv", "markdown", "latex")}
     found.write(**files)
     report = json.loads(files["json"].read_text())
-    assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith(
-        "mean over the images of a frame"
-    )
+    assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith("mean over the images of a frame")
     assert report["protocol"] == {
         "name": "lhm",
         "settings": {
@@ -260,9 +258,7 @@ def test_the_command(people, folders, tmp_path, humangs):
     out = tmp_path / "out"
     out.mkdir()
     options = ("--predictions", tmp_path / "theirs", "--protocol", "lhm++")
-    code, printed, error = run(
-        folders, *options, "--json", out / "a.json", "--html", out / "a.html", "--csv", out / "a.csv"
-    )
+    code, printed, error = run(folders, *options, "--json", out / "a.json", "--html", out / "a.html", "--csv", out / "a.csv")
     assert code == 0, error
     assert "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
     code, printed, error = run(folders, *options, "--inputs", 2)

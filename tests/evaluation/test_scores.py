@@ -44,9 +44,7 @@ def torchmetrics_ssim(x, y):
 
 
 SSIM = {
-    GAUSSIAN: lambda x, y: structural_similarity(
-        x, y, win_size=11, gaussian_weights=True, data_range=1, channel_axis=-1
-    ),
+    GAUSSIAN: lambda x, y: structural_similarity(x, y, win_size=11, gaussian_weights=True, data_range=1, channel_axis=-1),
     UNIFORM: lambda x, y: structural_similarity(x, y, data_range=1, channel_axis=-1),
     TORCHMETRICS: torchmetrics_ssim,
 }
@@ -192,10 +190,7 @@ def test_what_is_not_defined_is_none_and_says_why():
     assert bare["psnr"] > 10 and [name for name, x in bare.items() if x is not None] == ["psnr", "ssim"]
     reasons = scores.missing_reasons(protocol, {}, masks=False, alpha=False)
     assert set(reasons) == set(bare) - {"psnr", "ssim"}
-    assert (
-        "no weights of LPIPS vgg" in reasons["lpips_vgg"]
-        and reasons["semi_transparent"] == "the true images have no masks"
-    )
+    assert "no weights of LPIPS vgg" in reasons["lpips_vgg"] and reasons["semi_transparent"] == "the true images have no masks"
     assert "alpha" in scores.missing_reasons(protocol, {}, masks=True, alpha=False)["iou"]
     (nobody,) = scores.score_views(predicted, capture_from(truth, 0 * masks), PROTOCOLS["giga"])
     assert [name for name, x in nobody.items() if x is not None] == ["foreground"] and nobody["foreground"] == 0

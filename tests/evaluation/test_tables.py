@@ -57,9 +57,7 @@ def test_the_interval_covers_the_true_mean_as_often_as_it_says():
 
 def test_tables_of_people():
     assert shown_mean(Mean(12.3456, 11.0, 13.0, 4, "people"), "psnr") == "12.35 [11.00, 13.00]"
-    assert (
-        markdown_table(["person", "PSNR"], [["a|b", "1.00"]]) == "| person | PSNR |\n| --- | ---: |\n| a\\|b | 1.00 |\n"
-    )
+    assert markdown_table(["person", "PSNR"], [["a|b", "1.00"]]) == "| person | PSNR |\n| --- | ---: |\n| a\\|b | 1.00 |\n"
     lines = latex_table(["person", "PSNR"], [["a_b & 5%", "1.00"], ["mean", "-"]]).splitlines()
     assert lines[0] == r"\begin{tabular}{lr}" and lines[4] == r"a\_b \& 5\% & 1.00 \\"
     assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]

@@ -22,9 +22,7 @@ class Some:
     people: int = 2
 
 
-def toy(
-    run: Run, folder: Path, some: Some = Some(3), sizes: tuple[float, ...] = (1.5,), way: Literal["a", "b"] = "a"
-) -> None:
+def toy(run: Run, folder: Path, some: Some = Some(3), sizes: tuple[float, ...] = (1.5,), way: Literal["a", "b"] = "a") -> None:
     """A toy.
 
     Options:
@@ -95,12 +93,8 @@ def test_a_table_goes_to_the_page_that_shows_it(tmp_path, monkeypatch):
 
 def test_the_list_imports_nothing_heavy_and_the_readme_has_all_names():
     code = "import sys; sys.argv[1:] = []; from experiments.harness import main; main(); print(sorted(sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=results.REPOSITORY
-    )
-    assert not {"jax", "numpy", "matplotlib"} & set(
-        done.stdout.splitlines()[-1].replace("'", "").strip("[]").split(", ")
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=results.REPOSITORY)
+    assert not {"jax", "numpy", "matplotlib"} & set(done.stdout.splitlines()[-1].replace("'", "").strip("[]").split(", "))
     readme = (harness.FOLDER / "README.md").read_text()
     for name, (_, line) in listed().items():
         assert f"{name} " in done.stdout and line, name

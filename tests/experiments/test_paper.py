@@ -76,13 +76,9 @@ def test_the_page_of_the_paper_says_what_the_results_say():
     numbers = claims.Numbers()
     said = {row.claim: row.verdict for row in claims.claims(numbers)}
     assert set(said.values()) == set(claims.VERDICTS)
-    assert (
-        said == bench.results("paper_claims")["verdicts"] and numbers.gray == bench.results("paper_claims")["untrained"]
-    )
+    assert said == bench.results("paper_claims")["verdicts"] and numbers.gray == bench.results("paper_claims")["untrained"]
     page = bench.PAGE.read_text()
-    assert page.index(claims.CONTRADICTED, page.index("| holds? |")) < page.index(
-        claims.CONSISTENT, page.index("| holds? |")
-    )
+    assert page.index(claims.CONTRADICTED, page.index("| holds? |")) < page.index(claims.CONSISTENT, page.index("| holds? |"))
     assert not any(line.rstrip(" |").endswith("yes") for line in page.splitlines() if line.startswith("|"))
 
 
@@ -111,9 +107,7 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
     assert "| humangs | 4 photos | 24.00 / 0.900 / - |  |  |" in texts["animation"]
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
     others, alone = texts["animation"].split("\n\n")
-    assert (
-        "animatable" not in others and "| animatable | fitted to each of 2 other people | 21.00 / 0.900 / - |" in alone
-    )
+    assert "animatable" not in others and "| animatable | fitted to each of 2 other people | 21.00 / 0.900 / - |" in alone
     assert "| humangs | standard | 21.00 / 0.900 / - |" in texts["views"]
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
     assert "| humangs | 4 photos | 24.00 / 0.900 / - | - |" in texts["domains"]

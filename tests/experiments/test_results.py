@@ -18,9 +18,7 @@ TABLE = "| run | PSNR | name |\n| --- | ---: | --- |\n| a | 1.0 | x |\n| b | 2.0
 def page(tmp_path):
     path = tmp_path / "docs" / "page.md"
     path.parent.mkdir()
-    path.write_text(
-        "before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
-    )
+    path.write_text("before\n<!-- table: x -->\nold\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n")
     return path
 
 
@@ -79,9 +77,7 @@ def test_what_differs_is_reported_and_rendered(page):
     publish(page, "x", TABLE)
     publish(page, "y", "text")
     page.write_text(page.read_text().replace("1.0", "9.9"))
-    assert render_pages(page.parents[1], write=False) == [
-        "page.md: differs from docs/results; run experiments/render_tables.py"
-    ]
+    assert render_pages(page.parents[1], write=False) == ["page.md: differs from docs/results; run experiments/render_tables.py"]
     assert "9.9" in page.read_text()
     assert render_pages(page.parents[1], write=True) == [] and TABLE in page.read_text()
     page.write_text(page.read_text().replace("table: y", "table: z").replace("<!-- end -->\nafter", ""))

@@ -51,9 +51,7 @@ def drawing(name):
 def draw(config, variables, inputs, queries):
     outputs, _ = apply_humangs(variables, inputs, config)
     own, nobody = part_variables(variables, "driver"), BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
-    one = lambda query: config.architecture.driver.apply(
-        own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.run()
-    )
+    one = lambda query: config.architecture.driver.apply(own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.run())
     return jnp.stack([one(query) for query in queries])
 
 
@@ -196,10 +194,7 @@ def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     other, same = driven(name, at=pose(seed=3))
     close(outputs.gaussians, same.gaussians, bound=0)  # the canonical ones know no target
     assert np.abs(frame.gaussians.means - other.gaussians.means).max() > 1e-4
-    assert (
-        np.abs(frame.gaussians.means - outputs.gaussians.means).max()
-        < small(name).architecture.driver.offset_scale + 1e-6
-    )
+    assert np.abs(frame.gaussians.means - outputs.gaussians.means).max() < small(name).architecture.driver.offset_scale + 1e-6
     fresh = random_variables(small(name))
     zeros = jax.tree_util.tree_map_with_path(
         lambda path, x: 0 * x if any(entry.key == "out" for entry in path) else x, fresh["params"]["driver"]
@@ -241,9 +236,7 @@ def test_the_texture_is_what_the_photos_show():
 def test_animatable_reads_no_photo_and_a_place_in_the_world_is_no_pose():
     inputs = inputs_of("animatable")
     frame, _ = driven("animatable")
-    noise = replace(
-        inputs, images=1 - inputs.images, foreground=~inputs.foreground, posed_vertices=2 * inputs.posed_vertices
-    )
+    noise = replace(inputs, images=1 - inputs.images, foreground=~inputs.foreground, posed_vertices=2 * inputs.posed_vertices)
     close(driven("animatable", noise)[0].gaussians, frame.gaussians, bound=0)
     turned = driven("animatable", at=replace(pose(root=[0.0, 2.0, 0.0]), translation=jnp.ones(3)))[0]
     straight = driven("animatable", at=pose(root=[0.0, 0.0, 0.0]))[0]
@@ -367,12 +360,7 @@ def test_front_and_back_show_both_sides_of_the_body():
     assert (front[..., 2] > 0.05).sum() >= middle / 2 and (back[..., 2] < -0.05).sum() >= middle / 2
     assert not (front[..., 2] < -0.05).any() and not (back[..., 2] > 0.05).any()
     rows, columns = np.nonzero(covered[:, :16])
-    assert (
-        np.corrcoef(columns, front[rows, columns, 0])[0, 1]
-        > 0.9
-        > -0.9
-        > np.corrcoef(rows, front[rows, columns, 1])[0, 1]
-    )
+    assert np.corrcoef(columns, front[rows, columns, 0])[0, 1] > 0.9 > -0.9 > np.corrcoef(rows, front[rows, columns, 1])[0, 1]
 
 
 @pytest.mark.slow

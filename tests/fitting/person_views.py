@@ -49,11 +49,7 @@ def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, siz
     rng, views = np.random.default_rng(seed), len(matrices)
     landmarks = np.broadcast_to(landmarks, (views, *landmarks.shape[-2:]))
     local = np.einsum("cab,ckb->cka", matrices[:, :3, :3], landmarks) + matrices[:, None, :3, 3]
-    points = (
-        local[..., :2] / local[..., 2:] * FOCAL
-        + np.asarray(SIZE) / 2
-        + rng.normal(0, 1, (*local.shape[:2], 2)) * pixels
-    )
+    points = local[..., :2] / local[..., 2:] * FOCAL + np.asarray(SIZE) / 2 + rng.normal(0, 1, (*local.shape[:2], 2)) * pixels
     hips = local[:, [NAMES.index("left_hip"), NAMES.index("right_hip")]].mean(1)
     own = []
     for each, middle in zip(local, hips, strict=True):

@@ -66,9 +66,7 @@ def test_a_good_fit(good):
     np.testing.assert_allclose(examination.noise, NOISE, rtol=0.25)
     np.testing.assert_allclose(examination.frames, RAYLEIGH[0.5] * NOISE, rtol=0.25)
     errors = np.linalg.norm(examination.landmarks - good[1].points, axis=-1)
-    np.testing.assert_allclose(
-        [np.median(own) for own in errors], [view.median for view in examination.report.views], rtol=1e-5
-    )
+    np.testing.assert_allclose([np.median(own) for own in errors], [view.median for view in examination.report.views], rtol=1e-5)
 
 
 @pytest.mark.slow

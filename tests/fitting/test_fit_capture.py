@@ -33,9 +33,7 @@ def folder(tmp_path_factory):
     K, pose = np.asarray(seen.K)[frames, views], np.asarray(seen.cam_from_world)[frames, views]
     images = np.full((len(order), SIZE, SIZE, 3), 0.5, np.float32)
     rest = np.zeros((len(FRAMES), 55, 3)), np.zeros((len(FRAMES), 3))
-    save_capture(
-        path, capture_from_arrays(images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body())
-    )
+    save_capture(path, capture_from_arrays(images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body()))
     (path / "body.npz").unlink()
     points, confidences = (np.asarray(x)[frames, views] for x in (seen.points, seen.confidences))
     return path, Keypoints(points, confidences, COCO_WHOLEBODY_133), joints
@@ -119,9 +117,7 @@ def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     for key in files.OPTIONAL:
         arrays.pop(key)
     np.savez(path / "fit.npz", deviations=arrays.pop("joint_std"), **arrays)
-    np.testing.assert_array_equal(
-        read_fit_record(path / "fit.npz").joint_std, fitted.record.joint_std.astype(np.float32)
-    )
+    np.testing.assert_array_equal(read_fit_record(path / "fit.npz").joint_std, fitted.record.joint_std.astype(np.float32))
 
 
 @pytest.mark.slow
@@ -134,9 +130,7 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
-    with pytest.raises(
-        ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "
-    ):
+    with pytest.raises(ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "):
         check_place(folder[0], target, overwrite=False)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "diary.txt").write_text("mine")

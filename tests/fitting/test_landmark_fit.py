@@ -336,9 +336,7 @@ def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
     ray = middle / np.linalg.norm(middle)
     side = np.cross([0, 0, 1], ray)
     turn = Rotation.from_rotvec(side / np.linalg.norm(side) * np.arccos(ray[2])).as_matrix()
-    pixels = (
-        points * [1, 1, 0] + middle
-    ) @ K.T  # in a plane before the camera, so that the middle of the hips stays there
+    pixels = (points * [1, 1, 0] + middle) @ K.T  # in a plane before the camera, so that the middle of the hips stays there
     pixels = pixels[..., :2] / pixels[..., 2:]
     seen = lambda i: SeenPerson(np.column_stack([pixels[i], np.ones(33)]), points[i] @ turn, 1.0)
     images = [ImagePeople(f"{i:03d}.png", (64, 64), (seen(i),)) for i in range(2)]

@@ -199,9 +199,7 @@ def turned(capture, views, vector):
     rotations = np.zeros((capture.view_count, 3), np.float32)
     rotations[views] = np.radians(vector)
     turns = transform.make(quaternion.matrix_from_axis_angle(jnp.asarray(rotations)), jnp.zeros((len(rotations), 3)))
-    return dataclasses.replace(
-        capture, cameras=replace(capture.cameras, cam_from_world=turns @ capture.cameras.cam_from_world)
-    )
+    return dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=turns @ capture.cameras.cam_from_world))
 
 
 def off(capture, truth):
@@ -313,7 +311,5 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
     assert fitted.report.errors["keypoint_error_px"].after < left.report.errors["keypoint_error_px"].after
     # a body that is wider than the masks: cameras stay only where the keypoints say that they are right
     masks = np.zeros(truth.images.shape[:3], np.float32)
-    said = lambda capture, known: str(
-        check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)
-    )
+    said = lambda capture, known: str(check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known))
     assert "--fixed-cameras" not in said(wrong, keypoints) + said(truth, None)

@@ -47,12 +47,8 @@ def truth():
     K = intrinsics_from_fov(0.9, SIZE, SIZE)
     cameras = orbit(translation, 2.6, jnp.asarray([0.2, 2.2, 4.4]), 0.1, K, SIZE, SIZE)
     vertices = jax.jit(lambda: pose_body(body, shape_body(body, jnp.zeros(3)), pose).vertices)()
-    large = [
-        rasterize_mesh(vertices, body.faces, cameras[i].resized(2 * SIZE, 2 * SIZE)).face_ids for i in range(VIEWS)
-    ]
-    masks = np.stack([(np.asarray(ids) >= 0).reshape(SIZE, 2, SIZE, 2).mean((1, 3)) for ids in large]).astype(
-        np.float32
-    )
+    large = [rasterize_mesh(vertices, body.faces, cameras[i].resized(2 * SIZE, 2 * SIZE)).face_ids for i in range(VIEWS)]
+    masks = np.stack([(np.asarray(ids) >= 0).reshape(SIZE, 2, SIZE, 2).mean((1, 3)) for ids in large]).astype(np.float32)
     images = np.repeat(1 - masks[..., None], 3, axis=-1)
     poses = jax.tree.map(lambda leaf: leaf[None], pose)
     names = ("front", "left", "right")
@@ -256,9 +252,7 @@ def sphere():
 
 def boundary_of(sphere, camera):
     vertices, faces = sphere
-    return body_boundary(
-        view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT
-    )
+    return body_boundary(view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT)
 
 
 def disc(radius, x=SIDE / 2):
@@ -297,9 +291,7 @@ def test_a_sphere_s_boundary_is_the_circle_of_its_tangents(sphere):
 def test_what_leaves_the_image_or_is_behind_the_camera_is_no_boundary(sphere):
     cut = boundary_of(sphere, camera(x=-1.0))
     assert len(cut.positions) == COUNT and (cut.positions > 0).all()
-    assert (
-        np.abs(np.linalg.norm(cut.positions - [SIDE / 2 - FOCAL / DISTANCE, SIDE / 2], axis=1) - IMAGE_RADIUS).max() < 3
-    )
+    assert np.abs(np.linalg.norm(cut.positions - [SIDE / 2 - FOCAL / DISTANCE, SIDE / 2], axis=1) - IMAGE_RADIUS).max() < 3
     assert len(boundary_of(sphere, camera(z=-DISTANCE)).positions) == 0
 
 
@@ -358,9 +350,7 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
         mask = disc(IMAGE_RADIUS + gap)
         matches = match(boundary, MaskView(mask, mask_boundary(mask, COUNT)), 10.0, COUNT)
         thick = jnp.full(len(pixels), clothes)
-        residuals = silhouette_residuals(
-            matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0
-        )
+        residuals = silhouette_residuals(matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0)
         return float(jnp.sum(jnp.square(residuals)))
 
     assert cost(4.0, 4.0) < 0.02 * cost(4.0, 0.0)

@@ -134,11 +134,7 @@ def test_results_are_written_whole(bare, truth, tmp_path):
     assert arrays["rotations"].shape == (1, 55, 3) and arrays["translations"].shape == (1, 3) and not pickled
     report = json.loads((tmp_path / "fit" / "scan_fit.json").read_text())
     np.testing.assert_allclose(report["world_from_scan"], bare.world_from_scan.matrix())
-    assert (
-        report["fitted"] == "scan"
-        and report["start"] == "landmarks"
-        and report["errors"] == bare.report.to_json()["errors"]
-    )
+    assert report["fitted"] == "scan" and report["start"] == "landmarks" and report["errors"] == bare.report.to_json()["errors"]
     mesh = trimesh.load(tmp_path / "fit" / "body_in_scan.ply", process=False)
     np.testing.assert_allclose(mesh.vertices, body_in_scan(bare), rtol=1e-4)
     with pytest.raises(ValueError, match="not empty"):

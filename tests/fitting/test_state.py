@@ -127,9 +127,7 @@ def test_a_shifted_camera_shifts_in_both_views_that_are_its_own(capture, origin)
     state = moved(state, centers=state.cameras.centers.at[0].set(jnp.asarray([0.0, 2.0, 0.0])))
     cameras = replace(capture.cameras, cam_from_world=cameras_of(origin, state)[1])
     shift = np.asarray(cameras.center - capture.cameras.center)
-    np.testing.assert_allclose(
-        shift, [[0, 2 * STD.camera_center, 0], [0, 0, 0], [0, 2 * STD.camera_center, 0]], atol=1e-5
-    )
+    np.testing.assert_allclose(shift, [[0, 2 * STD.camera_center, 0], [0, 0, 0], [0, 2 * STD.camera_center, 0]], atol=1e-5)
 
 
 def test_the_root_turns_about_the_pelvis_by_small_turns_even_near_half_a_turn(capture, origin):
@@ -334,9 +332,7 @@ PROGRAMS = {
     "look_at": lambda: precisions(looking, jnp.ones(3)),
     "rays": lambda: precisions(camera.plucker_rays, CAMERA),
     "project": lambda: precisions(camera.project, CAMERA, jnp.ones((4, 3))),
-    "transform": lambda: precisions(
-        lambda a, p: transform.apply(transform.invert_rigid(a), p), jnp.eye(4), jnp.ones((5, 3))
-    ),
+    "transform": lambda: precisions(lambda a, p: transform.apply(transform.invert_rigid(a), p), jnp.eye(4), jnp.ones((5, 3))),
     "svd": lambda: precisions(quaternion.left_singular_vectors, jnp.ones((2, 3, 3))),
     "slerp": lambda: precisions(quaternion.interpolate, jnp.ones((2, 3)), jnp.ones((2, 3)), jnp.ones(2)),
     "skinning": lambda: precisions(model.blend_transforms, jnp.ones((3, J)), jnp.ones((J, 4, 4))),
@@ -346,15 +342,9 @@ PROGRAMS = {
     "rotated": lambda: precisions(lambda g, t: skin_gaussians(g, t, "rotation"), GAUSSIANS, jnp.ones((5, 4, 4))),
     "splats": lambda: precisions(lambda g: project_gaussians(g, CAMERA), GAUSSIANS),
     "triangulation": lambda: precisions(triangulate_robustly, ONE),
-    "keypoints": lambda: precisions(
-        lambda state: frame_residuals(PROBLEM, ONE, state, 5.0), zero_state(PROBLEM.origin)
-    ),
-    "starts": lambda: precisions(
-        lambda seen: landmark_fit._rigid_starts(PROBLEM, seen, jnp.ones((8, 3)), jnp.ones(8), 2), ONE
-    ),
-    "distance": lambda: precisions(
-        lambda x: landmark_fit._metres_per_pixel(ONE, x, jnp.ones((VIEWS, 8))), jnp.ones((8, 3))
-    ),
+    "keypoints": lambda: precisions(lambda state: frame_residuals(PROBLEM, ONE, state, 5.0), zero_state(PROBLEM.origin)),
+    "starts": lambda: precisions(lambda seen: landmark_fit._rigid_starts(PROBLEM, seen, jnp.ones((8, 3)), jnp.ones(8), 2), ONE),
+    "distance": lambda: precisions(lambda x: landmark_fit._metres_per_pixel(ONE, x, jnp.ones((VIEWS, 8))), jnp.ones((8, 3))),
     "scan": lambda: precisions(from_scan, zero_state(PROBLEM.origin)),
     "refinement": lambda: precisions(clothed, zero_state(MOVED)),
     "Levenberg and Marquardt": lambda: precisions(lambda x: solve(jnp.sin, x, 3, method="lm"), jnp.ones(4)),

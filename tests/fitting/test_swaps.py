@@ -173,9 +173,7 @@ def test_hands_at_each_others_wrists():
     _, keypoints = person(0, 2, 4, kind=COCO_WHOLEBODY_133)
     names = tuple(f"view{i}" for i in range(8))
     assert find_exchanged_hands(keypoints, names) == ()
-    hands = [
-        i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))
-    ]
+    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
     points = keypoints.points.copy()
     points[3, hands] = points[3, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
     found = find_exchanged_hands(dataclasses.replace(keypoints, points=points), names)

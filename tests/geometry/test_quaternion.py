@@ -127,12 +127,8 @@ def test_factors_rebuild_the_gram_matrix(dtype, tolerance, seed, stretch):
     assert np.allclose(np.sort(s, -1)[:, ::-1], expected, rtol=0, atol=tolerance * expected.max())
 
 
-@pytest.mark.parametrize(
-    "m", [np.zeros((3, 3)), np.eye(3), np.outer([1, 2, 3], [1, 0, 1]), np.diag([1, 1e-20, 0]), -np.eye(3)]
-)
+@pytest.mark.parametrize("m", [np.zeros((3, 3)), np.eye(3), np.outer([1, 2, 3], [1, 0, 1]), np.diag([1, 1e-20, 0]), -np.eye(3)])
 def test_degenerate_matrices_give_rotations(m):
     u, s = map(np.asarray, left_singular_vectors(jnp.asarray(m, jnp.float32)))
-    assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(
-        np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE
-    )
+    assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE)
     assert np.allclose(u @ np.diag(s**2) @ u.T, m @ m.T, atol=FLOAT32_TOLERANCE * max(1, np.abs(m @ m.T).max()))

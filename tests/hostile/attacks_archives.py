@@ -19,9 +19,7 @@ def raw_zip(members):
         directory += b"PK\1\2" + struct.pack("<H", 20) + common + struct.pack("<HHHII", 0, 0, 0, 0, len(body)) + name
         body += b"PK\3\4" + common + name + data
     count = min(len(members), 0xFFFF)
-    return (
-        bytes(body) + directory + b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, count, count, len(directory), len(body), 0)
-    )
+    return bytes(body) + directory + b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, count, count, len(directory), len(body), 0)
 
 
 def deflated_zeros(size, start=b""):
@@ -72,9 +70,7 @@ HEADERS = {
     "version 9": npy_header(version=(9, 0)),
     "characters that do not exist": npy_header("'<U1'", shape="(1,)") + b"\xff\xff\xff\x7f",
 }
-ARCHIVES = {
-    f"with {kind}": npz_of(("x.npy", data + bytes(16 * (kind == "objects")))) for kind, data in HEADERS.items()
-} | {
+ARCHIVES = {f"with {kind}": npz_of(("x.npy", data + bytes(16 * (kind == "objects")))) for kind, data in HEADERS.items()} | {
     "with two members of one name": None,
     "encrypted": raw_zip([(b"x.npy", 0, bytes(20), 20)]).replace(b"PK\3\4\x14\0\0\0", b"PK\3\4\x14\0\1\0"),
     "compressed in another way": raw_zip([(b"x.npy", 14, bytes(20), 20)]),

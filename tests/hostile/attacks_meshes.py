@@ -32,9 +32,7 @@ def instances(content):
 
 def chain_of_nodes(content):
     first = len(content["nodes"])
-    content["nodes"] += [{"children": [first + i + 1], "name": f"c{i}"} for i in range(5000)] + [
-        {"mesh": 0, "name": "end"}
-    ]
+    content["nodes"] += [{"children": [first + i + 1], "name": f"c{i}"} for i in range(5000)] + [{"mesh": 0, "name": "end"}]
     content["scenes"][0]["nodes"] = [first]
 
 

@@ -141,9 +141,7 @@ DECODED = {
     "a false checksum of the pixels": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IDAT"),
     "a false checksum of the palette": damaged(BY_PALETTE, b"PLTE"),
     "a false checksum of the end": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IEND"),
-    "a false checksum of a text": damaged(
-        png(4, 4, data=zlib.compress(bytes(52)), extra=chunk(b"tEXt", b"a\0b")), b"tEXt"
-    ),
+    "a false checksum of a text": damaged(png(4, 4, data=zlib.compress(bytes(52)), extra=chunk(b"tEXt", b"a\0b")), b"tEXt"),
     "no end": png(4, 4, data=zlib.compress(bytes(52)))[:-12],
 }
 for kind, data in DECODED.items():

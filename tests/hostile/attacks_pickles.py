@@ -122,9 +122,7 @@ def repeated_encode():
 
 def sparse(kind="csc", shape=(3, 3), indptr=(0, 1, 1, 1), indices=(0,), data=(1.0,)):
     """A sparse matrix with the state that scipy writes."""
-    array = lambda values, code: numpy_array(
-        numpy_dtype(code), shape_of(len(values)), raw(np.asarray(values, code).tobytes())
-    )
+    array = lambda values, code: numpy_array(numpy_dtype(code), shape_of(len(values)), raw(np.asarray(values, code).tobytes()))
     state = EMPTY_DICT + MARK + word("_shape") + (number(shape[0]) + number(shape[1]) + TUPLE2)
     state += word("data") + array(data, "f8") + word("indices") + array(indices, "i4")
     state += word("indptr") + array(indptr, "i8") + b"u"
@@ -152,24 +150,12 @@ PICKLES = {
     "an instance of the old kind": MARK + word("x") + b"ios\nsystem\n",
     "an object of the old kind": MARK + name_of("os", "system") + word("x") + b"o",
     "a persistent id": b"Pos.system\n",
-    "a state for the reconstructor": name_of("copyreg", "_reconstructor")
-    + EMPTY_DICT
-    + word("x")
-    + number(1)
-    + SETITEM
-    + BUILD,
+    "a state for the reconstructor": name_of("copyreg", "_reconstructor") + EMPTY_DICT + word("x") + number(1) + SETITEM + BUILD,
     "a state for _frombuffer": name_of("numpy._core.numeric", "_frombuffer")
     + (EMPTY_DICT + word("__code__") + number(1) + SETITEM)
     + BUILD,
     "a state for ndarray": name_of("numpy", "ndarray") + EMPTY_DICT + word("x") + number(1) + SETITEM + BUILD,
-    "slots of ndarray": name_of("numpy", "ndarray")
-    + b"N"
-    + EMPTY_DICT
-    + word("x")
-    + number(1)
-    + SETITEM
-    + TUPLE2
-    + BUILD,
+    "slots of ndarray": name_of("numpy", "ndarray") + b"N" + EMPTY_DICT + word("x") + number(1) + SETITEM + TUPLE2 + BUILD,
     "a reconstructed type": name_of("copyreg", "_reconstructor")
     + name_of("builtins", "object")
     + name_of("builtins", "object")

@@ -98,9 +98,7 @@ def begun(command: Command, folder: Path, inputs: Path):
 def changed(place: Path, before: dict) -> list[str]:
     final, other = writers.snapshot(place)
     names = {name for name in before | final if before.get(name) != final.get(name) and name.split("/")[0] not in GROWS}
-    return [f"{name}: changed" for name in sorted(names)] + [
-        f"{name}: left over" for name in other if "orbax" not in name
-    ]
+    return [f"{name}: changed" for name in sorted(names)] + [f"{name}: left over" for name in other if "orbax" not in name]
 
 
 def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
@@ -114,9 +112,7 @@ def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
         shutil.copytree(saved, place)
         if disk.mounted:
             disk.leave(int(share * size))
-        ending = writers.run(
-            command, place, inputs, 2, most=None if disk.mounted else max(LEAST, int(share * size / 4))
-        )
+        ending = writers.run(command, place, inputs, 2, most=None if disk.mounted else max(LEAST, int(share * size / 4)))
         found = [] if ending.code == 0 else refused(ending, targets(expected)) + changed(place, before)
         if disk.mounted:
             disk.leave(None)

@@ -67,9 +67,7 @@ VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
 VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
 SIZES = (0, 1, 2, 3, 4, 5, 9, 17, 55, 165)
-WORDS = [
-    *b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()
-]
+WORDS = [*b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()]
 WORDS += [b"9" * 400, b"", b"\0", b"\xff", b"\n", b": ", b"f 1 2 3", b"v 1 2 3"]
 OPCODES = [bytes([each.code.encode("latin1")[0]]) for each in pickletools.opcodes]
 STACK = [b"0", b"2", b"(", b"R", b"b", b"\x81", b"\x85", b"\x86", b"t", b"s", b"u", b"e"]
@@ -390,9 +388,7 @@ def main():
     worker.warm_up(readers, folder)
     watch = worker.Watch()
     worker.limit_memory()
-    while waiting := [
-        name for name in names if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]
-    ]:
+    while waiting := [name for name in names if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]]:
         name = min(waiting, key=lambda each: figures[each]["inputs"])
         own = figures[name]
         chunk = min(CHUNK, arguments.inputs - own["inputs"])

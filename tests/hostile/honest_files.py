@@ -228,9 +228,7 @@ def shelf():
 def write_colmap_binary(folder):
     lens = struct.pack("<QiiQQ4d", 1, 1, 1, 10, 12, 60, 60, 5, 6)
     (folder / "cameras.bin").write_bytes(lens)
-    image = lambda i, name: (
-        struct.pack("<i7di", i, 0, 1, 0, 0, 0, 0.9, 2.6, 1) + name + struct.pack("<Qddq", 1, 5, 6, i)
-    )
+    image = lambda i, name: struct.pack("<i7di", i, 0, 1, 0, 0, 0, 0.9, 2.6, 1) + name + struct.pack("<Qddq", 1, 5, 6, i)
     images = b"".join(image(i, f"photos/{name}.png\0".encode()) for i, name in enumerate(VIEWS, 1))
     (folder / "images.bin").write_bytes(struct.pack("<Q", len(VIEWS)) + images)
     point = lambda i: struct.pack("<Q3d3BdQii", i, 0, 0.9, 0, 9, 9, 9, 0.1, 1, i, 0)
@@ -388,9 +386,7 @@ def write_glb_motion(path):
     joints = [name for name in JOINT_NAMES if name in names]
     above = {name: JOINT_NAMES[PARENTS[JOINT_NAMES.index(name)]] for name in joints[1:]}
     place = lambda name: rest[JOINT_NAMES.index(name)]
-    nodes = [
-        {"name": names[n], "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist()} for n in joints
-    ]
+    nodes = [{"name": names[n], "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist()} for n in joints]
     for name, node in zip(joints, nodes, strict=True):
         if children := [joints.index(other) for other in joints if above.get(other) == name]:
             node["children"] = children

@@ -242,9 +242,9 @@ def stand_ins(variant):
         "training.loop.gaussian_body": lambda body, _: body,
         "training.loop.validate": validated,
         "training.sources.build_bank": bank,
-        "training.sources.on_the_fly_people": lambda _: importlib.import_module(
-            "humangs_jax.training.sources"
-        ).captured_people([Path(os.environ["KILLS_INPUTS"]) / "people" / "a"], load_body()),
+        "training.sources.on_the_fly_people": lambda _: importlib.import_module("humangs_jax.training.sources").captured_people(
+            [Path(os.environ["KILLS_INPUTS"]) / "people" / "a"], load_body()
+        ),
     }
 
 
@@ -265,6 +265,4 @@ def make_inputs(inputs: Path) -> None:
     write_npz(inputs / "keypoints.npz", arrays | {"confidences": record.keypoints.confidences})
     (inputs / "scan.obj").write_text(sphere().export(file_type="obj"))
     (inputs / "any.pt").write_bytes(b"")
-    (inputs / "train.json").write_text(
-        config_to_json(dataclasses.replace(config.tiny(), steps=6, checkpoint_every=2), indent=1)
-    )
+    (inputs / "train.json").write_text(config_to_json(dataclasses.replace(config.tiny(), steps=6, checkpoint_every=2), indent=1))

@@ -171,9 +171,7 @@ def main():
     print("\n".join(faults))
     for key, unit in (("seconds", 1), ("bytes", 1 << 20)):
         most = sorted(results.values(), key=lambda result, key=key: -result.get(key, 0))[:8]
-        print(
-            "\n".join(f"{each.get(key, 0) / unit:.2f} {key if unit == 1 else 'MiB'}  {each['name']}" for each in most)
-        )
+        print("\n".join(f"{each.get(key, 0) / unit:.2f} {key if unit == 1 else 'MiB'}  {each['name']}" for each in most))
     print(Counter(result["outcome"] for result in results.values()))
     print(f"{len(CASES)} files, {len({case.reader for case in CASES})} readers, {len(faults)} faults")
 

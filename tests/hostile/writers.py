@@ -67,9 +67,7 @@ RUN = ("run/checkpoints/*", "run/tensorboard/*")
 SYNTH = "synth --out people --subjects {} --size 128 --views 2 --close-views 0 --workers 1 --held-out 1"
 TRAIN = {"first": None, "varies": ("run/log.jsonl",), "own": RUN, "often": ("run/*.safetensors",)}
 COMMANDS = (
-    Command(
-        "import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"
-    ),
+    Command("import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
     Command("fit elsewhere", f"fit {{inputs}}/capture {CAPTURE} --out fitted"),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
@@ -89,9 +87,7 @@ COMMANDS = (
     Command("export glb", "export {inputs}/avatar{v}.npz --out me.glb"),
     Command("export html", "export {inputs}/avatar{v}.npz --html me.html"),
     Command("synth", SYNTH.format(2), first=SYNTH.format(1)),
-    Command(
-        "train", "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people", **TRAIN
-    ),
+    Command("train", "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people", **TRAIN),
     Command("train --on-the-fly", "train --out run --on-the-fly 2 --config {inputs}/train.json", **TRAIN),
     Command(
         "start",
@@ -172,9 +168,7 @@ class Changes:
             os.write(self.tell, b"!")
 
 
-def start(
-    command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None
-):
+def start(command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None):
     """Begins a run; most: bytes that a file may have, as on a disk that is full then. Returns what `end` wants."""
     log = inputs.with_name("logs") / f"{place.name}.{variant}"  # not on a disk that is full
     shutil.rmtree(log, ignore_errors=True)
@@ -343,9 +337,7 @@ def weights_are_whole(data: bytes) -> bool:
     try:
         size = 8 + int.from_bytes(data[:8], "little")
         header = json.loads(data[8:size])
-        return size + max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__") == len(
-            data
-        )
+        return size + max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__") == len(data)
     except (ValueError, LookupError):
         return False
 
@@ -430,6 +422,4 @@ def place_of(command: Command, folder: Path, inputs: Path, name: str) -> Path:
 
 def error_lines(text: str) -> list[str]:
     """Lines of stderr that are no progress bar."""
-    return [
-        line for line in re.split(r"[\r\n]+", text) if line.strip() and not re.search(r"\d+%\||\d+it \[|it/s", line)
-    ]
+    return [line for line in re.split(r"[\r\n]+", text) if line.strip() and not re.search(r"\d+%\||\d+it \[|it/s", line)]

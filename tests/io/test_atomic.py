@@ -121,9 +121,7 @@ def test_an_interrupt_while_the_old_folder_is_deleted_leaves_nothing_of_it(tmp_p
         remove(path, **options)
 
     monkeypatch.setattr(atomic.shutil, "rmtree", interrupted)
-    before = signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # shells start what runs in the background without it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
     try:
         with pytest.raises(KeyboardInterrupt):
             atomic.replace_folder(folder, writes("new"), mark=MARK)
@@ -208,9 +206,7 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     os.utime(old, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
     atomic.add_files(tmp_path / "other", writes_into("new"))
-    folder_with(
-        leftover(tmp_path / "other", "new", dead_process), "of one that was killed after it had made the folder"
-    )
+    folder_with(leftover(tmp_path / "other", "new", dead_process), "of one that was killed after it had made the folder")
     atomic._sweep.cache_clear()  # a new process sweeps
     atomic.add_files(tmp_path / "other", writes_into("newer"))
     assert not leftover(tmp_path / "other", "new", dead_process).exists()

@@ -43,9 +43,7 @@ def area_average(image, size):
 
 @settings(max_examples=40, deadline=None)
 @given(SIDE, SIDE, SIDE, SIDE, st.sampled_from([(), (1,), (3,)]), st.integers(0, 1000))
-def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(
-    height, width, new_height, new_width, channels, seed
-):
+def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(height, width, new_height, new_width, channels, seed):
     image = np.random.default_rng(seed).integers(0, 2, (height, width, *channels)).astype(np.float32)
     found = resized(image, new_width, new_height)
     assert found.shape == (new_height, new_width, *channels) and found.dtype == np.float32
@@ -67,14 +65,10 @@ def test_enlarging_is_bicubic(size):
     """As Pillow does it, but for the rim, and for what it leaves outside of the range of the image."""
     image = np.random.default_rng(0).random((31, 40), np.float32)
     theirs = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
-    y, x = (
-        2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True)
-    )  # where a pixel beyond the rim counts
+    y, x = (2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True))  # where a pixel beyond the rim counts
     assert theirs.max() > 1
     inside = np.s_[y : size[1] - y, x : size[0] - x]
-    np.testing.assert_allclose(
-        resized(image, *size)[inside], np.clip(theirs, image.min(), image.max())[inside], atol=ROUNDING
-    )
+    np.testing.assert_allclose(resized(image, *size)[inside], np.clip(theirs, image.min(), image.max())[inside], atol=ROUNDING)
 
 
 def test_a_ramp_stays_a_ramp():
@@ -95,9 +89,7 @@ def test_bytes_are_averaged_as_numbers():
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-@pytest.mark.parametrize(
-    ("value", "expected"), [(26, 26 * 50 / 43.27), (0, None), (None, None), ("26", None), ((26, 27), None)]
-)
+@pytest.mark.parametrize(("value", "expected"), [(26, 26 * 50 / 43.27), (0, None), (None, None), ("26", None), ((26, 27), None)])
 def test_focal_length_is_that_of_the_diagonal(kind, value, expected, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -233,9 +225,7 @@ def test_soft_masks_keep_their_greys(tmp_path):
 TWO = PERSON * 1 + (np.arange(8) > 3) * PERSON
 REFUSED = {
     "a palette of the labels 1, 2: which is the person": palette(TWO, VOC),
-    "a palette of the labels 0, 1: 0 is not black: which is the background": palette(
-        PERSON * 1, [9, 9, 200, 200, 9, 9]
-    ),
+    "a palette of the labels 0, 1: 0 is not black: which is the background": palette(PERSON * 1, [9, 9, 200, 200, 9, 9]),
     "labels 0, 1: 0 is not black": palette(PERSON * 1, [255, 255, 255, 0, 0, 0]),
     "2 colors: which is the person": pixels(colored(TWO == 1, (255, 0, 0)) + colored(TWO == 2, (0, 255, 0))),
     "2 colors without black: which": pixels(colored(PERSON, (255, 0, 0), (0, 0, 200))),

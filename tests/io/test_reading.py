@@ -59,9 +59,7 @@ def test_limits_are_those_of_the_environment(monkeypatch):
             limits()
 
 
-TOO_LONG = (
-    r"a\.json: 203 bytes: the limit text_bytes is 100 \(HUMANGS_LIMITS=text_bytes=203 raises it; docs/security\.md\)$"
-)
+TOO_LONG = r"a\.json: 203 bytes: the limit text_bytes is 100 \(HUMANGS_LIMITS=text_bytes=203 raises it; docs/security\.md\)$"
 
 
 def test_a_limit_is_named_and_can_be_changed(tmp_path):

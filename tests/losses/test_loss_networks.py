@@ -188,10 +188,7 @@ def test_what_is_wrong_is_named(change, message, tmp_path):
 
 def test_twice_the_same_network_is_no_problem():
     tensors = state("squeeze")
-    assert (
-        find_layers(tensors | {f"copy.{key}": x for key, x in tensors.items()}, "SqueezeNet 1.1").keys()
-        == tensors.keys()
-    )
+    assert find_layers(tensors | {f"copy.{key}": x for key, x in tensors.items()}, "SqueezeNet 1.1").keys() == tensors.keys()
 
 
 def test_another_network_is_recognised():

@@ -74,9 +74,7 @@ def test_the_spread_of_a_ray_is_the_sum_over_pairs():
     pairs = np.einsum("ri,rj,rij->r", weights, weights, (z[:, :, None] - z[:, None]) ** 2)
     alpha = weights.sum(1)
     depth, squared = ((weights * z**power).sum(1) / alpha for power in (1, 2))
-    np.testing.assert_allclose(
-        ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES
-    )
+    np.testing.assert_allclose(ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES)
 
 
 def test_surfaces_are_compared_where_both_are_the_persons():

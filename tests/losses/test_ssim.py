@@ -27,9 +27,7 @@ WINDOW = GAUSSIAN.size
 
 def ssim(predicted, target):
     """scikit-image's."""
-    return structural_similarity(
-        predicted, target, win_size=WINDOW, gaussian_weights=True, data_range=1, channel_axis=-1
-    )
+    return structural_similarity(predicted, target, win_size=WINDOW, gaussian_weights=True, data_range=1, channel_axis=-1)
 
 
 def pair(seed, height=40, width=33, noise=0.1):

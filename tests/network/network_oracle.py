@@ -298,9 +298,7 @@ class Network:
             if not o.all_views:
                 i, j = (np.round((ndc[k] + 1) / 2 * (size - 1)) for k, size in enumerate((w, h)))
                 inside = (i >= 0) & (i < w) & (j >= 0) & (j < h)
-                surface = arrays["in_depth_map"][view, 0][
-                    np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)
-                ]
+                surface = arrays["in_depth_map"][view, 0][np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
                 surface = np.where(inside, surface, 0)
                 seen = (z < surface + 0.05) & (z > 0) & (np.abs(ndc) < 1).all(0)
             grid = maps[view]
@@ -336,9 +334,7 @@ class Network:
         }
         T = np.einsum("gj,jab->gab", weights, arrays["in_joint_transforms"])
         stages["posed_means3D"] = np.einsum("gab,gb->ga", T[:, :3, :3], means) + T[:, :3, 3]
-        stages["posed_rotations"] = np.stack(
-            [skinned_quaternion(m, q) for m, q in zip(T[:, :3, :3], quats, strict=True)]
-        )
+        stages["posed_rotations"] = np.stack([skinned_quaternion(m, q) for m, q in zip(T[:, :3, :3], quats, strict=True)])
         return stages
 
 

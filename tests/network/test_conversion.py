@@ -228,9 +228,7 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     }
     path = write_checkpoint(tmp_path / "a.pt", {"model": tensors(state) | losses, "optimizer": {}})
     weights = tmp_path / "w.safetensors"
-    code, out, error = run(
-        monkeypatch, capsys, "convert", path, "--out", weights, "--head-width", "4", "--pool", "visible"
-    )
+    code, out, error = run(monkeypatch, capsys, "convert", path, "--out", weights, "--head-width", "4", "--pool", "visible")
     assert code == 0, error
     assert "skipped 2 tensors" in out and "loss_computer" in out and "4 layers of 4 heads" in out
     variables, config = load_weights(weights)
@@ -283,9 +281,7 @@ def test_losses_that_cannot_be_kept(name, message, tmp_path, monkeypatch, capsys
     path = write(tmp_path, oracle.random_state(Options()))
     arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / name)
     code, out, error = run(monkeypatch, capsys, "convert", path, *arguments)
-    assert (
-        code == (1 if "a.pt" in message else 2) and out == "" and error.count("\n") == 1 and re.search(message, error)
-    )
+    assert code == (1 if "a.pt" in message else 2) and out == "" and error.count("\n") == 1 and re.search(message, error)
     assert os.listdir(tmp_path) == ["a.pt"]
 
 

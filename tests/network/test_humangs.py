@@ -62,10 +62,7 @@ def test_presets_have_the_shapes_they_promise(name):
     side = size // encoder.patch_size * (4 if encoder.upsampler else 1)
     width = encoder.upsampler.hidden // 2 if encoder.upsampler else encoder.transformer.width
     assert encoding.maps.shape == (views, side, side, width)
-    assert (
-        encoding.maps.dtype == (jnp.bfloat16 if config.runtime.dtype == "bfloat16" else jnp.float32)
-        or side == size // 8
-    )
+    assert encoding.maps.dtype == (jnp.bfloat16 if config.runtime.dtype == "bfloat16" else jnp.float32) or side == size // 8
     assert outputs.gaussians.means.shape == (vertices * decoder.gaussians_per_vertex, 3)
     assert outputs.tight_offsets.shape == (vertices, 1, 3)
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables)))
@@ -135,9 +132,7 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_color_of_the_photos():
 
 def test_deeper_blocks_begin_smaller():
     config = TransformerConfig(width=64, layers=4, head_width=32)
-    kernel = jax.jit(Block(config, Runtime(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"][
-        "kernel"
-    ]
+    kernel = jax.jit(Block(config, Runtime(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"]["kernel"]
     assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
 
 
@@ -175,9 +170,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     variables = variables_of(TINY)
     roomy, exact, tight = TINY, *(TINY.with_runtime(token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
-    assert outputs.dropped_tokens == 0 and close(
-        (encoding, outputs), run(variables, inputs, exact)
-    )  # padding is nothing
+    assert outputs.dropped_tokens == 0 and close((encoding, outputs), run(variables, inputs, exact))  # padding is nothing
     touched = np.kron(foreground.reshape(2, 4, 8, 4, 8).any((2, 4)), np.ones((8, 8), bool))
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
@@ -188,9 +181,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dtype", "tolerance"), [("bfloat16", BFLOAT16_TOLERANCE), ("float16", BFLOAT16_TOLERANCE / 4)]
-)
+@pytest.mark.parametrize(("dtype", "tolerance"), [("bfloat16", BFLOAT16_TOLERANCE), ("float16", BFLOAT16_TOLERANCE / 4)])
 def test_short_number_types_are_close(dtype, tolerance):
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
     encoding, outputs = run(variables, inputs, ALL_TOKENS.with_runtime(dtype=dtype))
@@ -208,9 +199,7 @@ def test_unseen_vertices_are_grey_and_pool_nothing():
     encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16), jnp.int32(0))
     variables = variables_of(TINY)
     features = read(variables, encoding, inputs, TINY)
-    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
-        features.photo_colors, np.full((20, 3), 0.5)
-    )
+    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(features.photo_colors, np.full((20, 3), 0.5))
     assert np.array_equal(features.visible_fraction, np.zeros(20))
     every = TINY.with_conventions(pool="all")
     assert np.abs(read(variables, encoding, inputs, every).local).min(axis=1).max() > 0
@@ -280,9 +269,7 @@ def gradients(variables, continuous, inputs, config):
 def test_gradients_are_finite_and_reach_every_parameter():
     inputs = random_inputs()
     cameras = inputs.cameras
-    posed = (
-        inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
-    )  # in and behind the camera
+    posed = inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)  # in and behind the camera
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
     continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
     config = TINY.with_runtime(remat="full")

@@ -134,9 +134,7 @@ def test_it_is_the_sum_over_a_neighbourhood_with_its_gradients():
         x, kernel, weights = random(*SHAPE), random(3, 3, SHAPE[-1], FEATURES), random(*SHAPE[:3], FEATURES)
         for function in (convolve, jax.jit(convolve)):
             np.testing.assert_allclose(function(x, kernel), reference(x, kernel), rtol=FLOAT64, atol=FLOAT64)
-            gradients = [
-                jax.grad(lambda *a, f=f: jnp.sum(weights * f(*a)), (0, 1))(x, kernel) for f in (function, reference)
-            ]
+            gradients = [jax.grad(lambda *a, f=f: jnp.sum(weights * f(*a)), (0, 1))(x, kernel) for f in (function, reference)]
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=FLOAT64, atol=FLOAT64), *gradients)
 
 
@@ -233,9 +231,7 @@ def test_statistics_follow_the_batch_only_in_training():
     evaluate = jax.jit(module.apply)
     trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(variables, maps)
     still = evaluate(variables, maps)
-    assert still.shape == trained.shape == (2, 12, 12, CONFIG.hidden // 2) and not np.allclose(
-        still, trained, atol=1e-3
-    )
+    assert still.shape == trained.shape == (2, 12, 12, CONFIG.hidden // 2) and not np.allclose(still, trained, atol=1e-3)
     of_the_batch = lambda new, old: (new - MOMENTUM * old) / (1 - MOMENTUM)
     statistics = jax.tree.map(of_the_batch, updated["batch_stats"], variables["batch_stats"])
     assert all((norm["var"] > 0).all() for norm in statistics.values())

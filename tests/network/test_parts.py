@@ -111,10 +111,5 @@ def test_the_pass_is_its_three_parts_and_can_be_looked_into():
     for a, b in zip(jax.tree.leaves(outputs.gaussians), jax.tree.leaves(parts.gaussians), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)  # fused in other ways
     found = jax.eval_shape(lambda v: intermediates(v, inputs, TINY), variables)
-    assert {"encoder", "encoder.tokenizer", "encoder.transformer.block_3", "reader", "decoder.geometry_out"} <= set(
-        found
-    )
-    assert (
-        found["encoder"].maps.shape == encoding.maps.shape
-        and found[""].gaussians.means.shape == outputs.gaussians.means.shape
-    )
+    assert {"encoder", "encoder.tokenizer", "encoder.transformer.block_3", "reader", "decoder.geometry_out"} <= set(found)
+    assert found["encoder"].maps.shape == encoding.maps.shape and found[""].gaussians.means.shape == outputs.gaussians.means.shape

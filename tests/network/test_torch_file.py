@@ -105,9 +105,7 @@ def test_no_code_of_a_file_runs(write, name, place, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["a.pt"]
 
 
-@pytest.mark.parametrize(
-    "name", ["torch.load", "torch.jit._script", "torch._utils._rebuild_qtensor", "torch.nn.Module"]
-)
+@pytest.mark.parametrize("name", ["torch.load", "torch.jit._script", "torch._utils._rebuild_qtensor", "torch.nn.Module"])
 def test_nor_does_any_other_call_of_torch(name, tmp_path):
     module, _, function = name.rpartition(".")
     data = b"\x80\x02}q\x00X\x05\x00\x00\x00modelc" + f"{module}\n{function}\n".encode() + b")Rs."

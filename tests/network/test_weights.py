@@ -157,9 +157,7 @@ def test_geometry_starts_anew_in_another_frame_alone():
     geometry = lambda tree: np.asarray(tree["params"]["decoder"]["geometry_out"]["kernel"])
     assert np.abs(geometry(fit_variables(variables, old, new))).max() < 0.01 < np.abs(geometry(variables)).max()
     frame = old.with_parts(decoder=dataclasses.replace(DECODER, frame="normal"))
-    assert np.array_equal(
-        geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame))
-    )
+    assert np.array_equal(geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame)))
 
 
 def test_fitting_to_the_same_network_changes_nothing():

@@ -107,15 +107,11 @@ def write_python2_stream(path, state, device="cuda:0"):
     text = lambda value: b"U" + bytes([len(value)]) + value.encode()
     count = lambda value: b"J" + struct.pack("<i", value)
     counts = lambda values: b"(" + b"".join(map(count, values)) + b"t"
-    metadata = (
-        text("_metadata") + b"ccollections\nOrderedDict\n(](](" + text("") + b"}" + text("version") + b"K\x01seetR"
-    )
+    metadata = text("_metadata") + b"ccollections\nOrderedDict\n(](](" + text("") + b"}" + text("version") + b"K\x01seetR"
 
     def tensor(i, x):
         kind = f"ctorch\n{KINDS[x.dtype]}\n".encode()
-        reference = (
-            b"(" + text("storage") + kind + text(str(i)) + text(device) + b"\x8a\x03" + x.size.to_bytes(3, "little")
-        )
+        reference = b"(" + text("storage") + kind + text(str(i)) + text(device) + b"\x8a\x03" + x.size.to_bytes(3, "little")
         view = count(0) + counts(x.shape) + counts(contiguous(x.shape))
         return b"ctorch._utils\n_rebuild_tensor_v2\n(" + reference + b"NtQ" + view + b"\x89NtR"
 

@@ -22,9 +22,7 @@ def posed(body):
 
 @pytest.fixture(scope="module")
 def camera(posed):
-    return cameras.cameras_around(
-        np.random.default_rng(0), posed.vertices, np.asarray([posed.rotations[0, 1]], float), SIZE
-    )[0]
+    return cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([posed.rotations[0, 1]], float), SIZE)[0]
 
 
 def faults(body, posed, camera):

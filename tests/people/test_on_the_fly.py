@@ -148,9 +148,9 @@ def test_batches_by_vmap_are_the_examples(bank, example):
 def test_it_lowers_for_accelerators(bank, platform):
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (bank, jax.random.key(0)))
     config = dataclasses.replace(CONFIG, views_at_once=3, pixels_per_step=1 << 30)
-    exported = jax.export.export(
-        jax.jit(on_the_fly.on_the_fly_example, static_argnames="config"), platforms=[platform]
-    )(*shapes, config=config)
+    exported = jax.export.export(jax.jit(on_the_fly.on_the_fly_example, static_argnames="config"), platforms=[platform])(
+        *shapes, config=config
+    )
     assert exported.platforms == (platform,)
     assert "callback" not in exported.mlir_module()
 

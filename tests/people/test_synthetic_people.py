@@ -142,9 +142,7 @@ def test_garments_move_with_the_pose(people):
     near_knee = np.linalg.norm(rest - (knee + np.asarray([0, 0.1, 0])), axis=1) < 0.15
     assert np.median(moved[near_knee]) > 0.05
     assert moved[(template[:, 1] > 0.25) & ~is_cloth].max() < 1e-5
-    shifted = person.posed_vertices(rotations, np.asarray([1.0, 2.0, 3.0])) - person.posed_vertices(
-        rotations, np.zeros(3)
-    )
+    shifted = person.posed_vertices(rotations, np.asarray([1.0, 2.0, 3.0])) - person.posed_vertices(rotations, np.zeros(3))
     np.testing.assert_allclose(shifted, np.broadcast_to([1.0, 2.0, 3.0], shifted.shape), atol=1e-5)
 
 
@@ -222,9 +220,7 @@ def test_a_written_subject_loads_back(tmp_path, body, people):
     np.testing.assert_array_equal(held_out.pose(0).rotations, inputs.pose(0).rotations)
     np.testing.assert_array_equal(inputs.betas, people[0].betas)
     assert np.abs(np.asarray(held_out.pose(1).rotations - held_out.pose(0).rotations)).max() > 0.05
-    gap = np.linalg.norm(
-        np.asarray(inputs.cameras.center)[:, None] - np.asarray(held_out.cameras.center)[None, :2], axis=-1
-    )
+    gap = np.linalg.norm(np.asarray(inputs.cameras.center)[:, None] - np.asarray(held_out.cameras.center)[None, :2], axis=-1)
     assert gap.min() > 1e-3  # no held-out view is an input view
     image, mask = subject.render_view(writer.sample_pose(people[0], 0), inputs.cameras[1])
     assert np.abs(image - inputs.images[1]).max() < 2 * EIGHT_BITS

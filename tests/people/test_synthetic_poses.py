@@ -59,9 +59,7 @@ def test_halfway_rotations_are_on_the_way(numbers, t):
     a, b = np.asarray(numbers[:3]), np.asarray(numbers[3:])
     middle = kin.between(a, b, t)
     angle = lambda x, y: np.linalg.norm(kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y)))
-    np.testing.assert_allclose(
-        [angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6
-    )
+    np.testing.assert_allclose([angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6)
 
 
 def test_all_joints_stay_within_their_limits(drawn):
@@ -146,9 +144,7 @@ def test_hands_stay_clear_of_the_body(build, drawn):
 
 def test_winding_numbers_count_how_often_a_mesh_goes_around():
     corners = np.asarray([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-    faces = np.asarray(
-        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
-    )  # a tetrahedron, seen from outside counter-clockwise
+    faces = np.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # a tetrahedron, seen from outside counter-clockwise
     twice = jnp.asarray(np.concatenate([corners, 0.5 * corners])), jnp.asarray(np.concatenate([faces, faces + 4]))
     points = jnp.asarray([[0.05, 0.05, 0.05], [0.3, 0.3, 0.3], [1.0, 1.0, 1.0], [-0.2, 0.1, 0.1]])
     np.testing.assert_allclose(winding_numbers(points, *twice), [2, 1, 0, 0], atol=1e-5)

@@ -115,9 +115,7 @@ def test_a_seed_is_a_motion_and_kinds_are_drawn(build, drawn):
 
 def test_a_sequence_is_a_motion_file(tmp_path, drawn):
     sequence = drawn["turn", 1]
-    motion = Motion(
-        jnp.asarray(sequence.rotations, jnp.float32), jnp.asarray(sequence.translations, jnp.float32), sequence.fps
-    )
+    motion = Motion(jnp.asarray(sequence.rotations, jnp.float32), jnp.asarray(sequence.translations, jnp.float32), sequence.fps)
     save_motion(tmp_path / "motion.npz", motion)
     loaded = load_motion(tmp_path / "motion.npz")
     np.testing.assert_array_equal(loaded.rotations, motion.rotations)

@@ -41,9 +41,7 @@ def test_grid_faces_look_towards_the_viewer():
     np.testing.assert_allclose(vertex_normals(surface.vertices, surface.faces), [[0, 0, 1]] * len(surface.vertices))
 
 
-@pytest.mark.parametrize(
-    "slope, level, expected", [(0.0, 0.37, 0.37), (1.0, 0.5, 0.5 * 0.5**2), (0.3, 0.61, 0.61 - 0.15)]
-)
+@pytest.mark.parametrize("slope, level, expected", [(0.0, 0.37, 0.37), (1.0, 0.5, 0.5 * 0.5**2), (0.3, 0.61, 0.61 - 0.15)])
 def test_a_cut_is_exact(slope, level, expected):
     surface = plane()
     x, y, _ = surface.vertices.T

@@ -25,9 +25,7 @@ def toy_avatar(body, shade):
     gaussians = Gaussians(
         rest.vertices, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)), jnp.full((n, 3), 0.03), jnp.full(n, 0.8), colors
     )
-    return Avatar(
-        gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
-    )
+    return Avatar(gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names)
 
 
 def toy_capture(body, avatar, views=3, moving=False, distance=3.6):

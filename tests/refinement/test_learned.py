@@ -201,9 +201,7 @@ def test_the_order_of_photos_does_not_matter(scene):
     rng, values = np.random.default_rng(3), stacked(parameters)
     graph, g = graph_of(np.asarray(avatar.gaussians.means)), len(values)
     signals = Signals(*(jnp.asarray(rng.random(shape), jnp.float32) for shape in ((3, g, COLUMNS), (3, g), (3, g))))
-    run = lambda s: refiner_iteration(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[
-        0
-    ]
+    run = lambda s: refiner_iteration(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[0]
     np.testing.assert_allclose(run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING)
 
 
@@ -225,9 +223,7 @@ def test_iterations_move_gaussians(scene):
 def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(scene, monkeypatch):
     avatar, photo, parameters, splat = scene
     looked, signals = [], learned.photo_signals
-    watched = lambda parameters, avatar, photo, *how: (
-        looked.append(int(photo.index)) or signals(parameters, avatar, photo, *how)
-    )
+    watched = lambda parameters, avatar, photo, *how: looked.append(int(photo.index)) or signals(parameters, avatar, photo, *how)
     monkeypatch.setattr(learned, "photo_signals", watched)
     photos = [replace(photo, index=jnp.asarray(i)) for i in range(9)]
     graph, small = graph_of(np.asarray(avatar.gaussians.means)), dataclasses.replace(splat, max_pairs=64)

@@ -64,9 +64,7 @@ def test_refined_avatars_look_the_same_at_other_sizes(person):
     assert refined.gaussians.low_pass is not None and avatar.gaussians.low_pass is None
     assert jnp.abs(drawn(refined, camera) - drawn(raw, camera)).mean() < SAME_SIZE
     reduced = drawn(raw, camera).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
-    errors = [
-        float(jnp.abs(drawn(a, camera.resized(WIDTH // 2, HEIGHT // 2)) - reduced).mean()) for a in (refined, raw)
-    ]
+    errors = [float(jnp.abs(drawn(a, camera.resized(WIDTH // 2, HEIGHT // 2)) - reduced).mean()) for a in (refined, raw)]
     assert errors[0] < 0.7 * errors[1]
     again = refinement.refine(refined, capture, dataclasses.replace(STEPS, steps=2))
     np.testing.assert_allclose(again.gaussians.low_pass, refined.gaussians.low_pass, rtol=0.01)
@@ -369,9 +367,7 @@ def test_the_state_with_the_highest_psnr_on_held_out_pixels_is_returned(person, 
 
 def test_what_makes_the_photos_worse_is_not_returned(person, monkeypatch):
     """Also if nothing is held out, so that the search keeps its last state."""
-    worse = lambda own, state, *_: replace(
-        state, parameters=replace(state.parameters, means=state.parameters.means + 0.2)
-    )
+    worse = lambda own, state, *_: replace(state, parameters=replace(state.parameters, means=state.parameters.means + 0.2))
     stepping(monkeypatch, worse)
     report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, steps=2))
     assert not report.kept and report.loss[0] == report.loss[1]

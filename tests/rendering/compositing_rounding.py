@@ -57,9 +57,7 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
         fading = np.log1p(-alpha)
         e_left = alpha * e_alpha / (1 - alpha) + 1
         rank = np.arange(1, n + 1)[:, None]
-        e_after = (
-            np.cumsum(e_left + 1 + LOG * -fading, axis=0) - (rank + n // CHUNK + 1) * np.cumsum(fading, axis=0) + EXP
-        )
+        e_after = np.cumsum(e_left + 1 + LOG * -fading, axis=0) - (rank + n // CHUNK + 1) * np.cumsum(fading, axis=0) + EXP
         after = np.exp(np.cumsum(fading, axis=0))
         T, e_T = (np.concatenate([np.full((1, p), first), a[:-1]]) for first, a in ((1.0, after), (0.0, e_after)))
         live = after > config.transmittance_stop
@@ -82,9 +80,7 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
         # dL/dlog alpha = ((g . f) T - (Q - sum of w g . f so far) / (1 - alpha)) raw
         total = (cotangent * features[tile]).sum(0) + g_transmittance[tile] * transmittance[tile]
         size = (abs(cotangent) * abs(features[tile])).sum(0) + abs(g_transmittance[tile]) * transmittance[tile]
-        b_total = (
-            (abs(cotangent) * b_features[tile]).sum(0) + abs(g_transmittance[tile]) * b_transmittance[tile] + 6 * size
-        )
+        b_total = (abs(cotangent) * b_features[tile]).sum(0) + abs(g_transmittance[tile]) * b_transmittance[tile] + 6 * size
         along, along_size = f @ cotangent, abs(f) @ abs(cotangent)
         seen = np.cumsum(w * along, axis=0)
         seen_size = np.cumsum(w * along_size, axis=0)

@@ -69,9 +69,7 @@ def test_case_against_plain_numpy(case):
     """Image, and derivatives by differences, of a splatter that shares no code with ours (numpy_splatter.py)."""
     scene = case.build()
     wide = lambda a: np.asarray(a, np.float64)
-    arguments = dict(
-        zip(cases.NAMES, map(wide, (*scene.gaussians, scene.K, scene.pose, scene.background)), strict=True)
-    )
+    arguments = dict(zip(cases.NAMES, map(wide, (*scene.gaussians, scene.K, scene.pose, scene.background)), strict=True))
     image, gradients = cases.tiled(scene)
     (rgb, alpha, _), _ = splat(**arguments, width=scene.width, height=scene.height)
     np.testing.assert_allclose(wide(image.rgb), rgb, rtol=0, atol=bound(case.image))

@@ -54,9 +54,7 @@ def from_scene(gaussians, grid, config):
     order = tiling.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
     ellipses = jax.tree.map(lambda plane: plane[order], tiling.footprints_by(projected, gaussians.opacities, config))
     pairs = tiling.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
-    features = jnp.concatenate(
-        [gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1
-    )
+    features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1)
     splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
     return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
 
@@ -101,9 +99,7 @@ def assert_lengths(ours, expected, counts):
 def assert_rounded(found, exact):
     """Float32 results within the bounds of their float64 analysis."""
     assert exact.decided  # no alpha at its threshold, no pixel at its stop: float32 decides as float64
-    for name, a, b, most in zip(
-        ("features", "transmittance", "sums", "peaks"), found, exact, exact.bounds, strict=False
-    ):
+    for name, a, b, most in zip(("features", "transmittance", "sums", "peaks"), found, exact, exact.bounds, strict=False):
         assert a.dtype == np.float32 and a.shape == b.shape
         excess = np.abs(np.asarray(a, np.float64) - b) / np.maximum(most, 1e-30)
         assert (excess <= 1).all(), (name, excess.max())

@@ -29,9 +29,7 @@ def test_affine_skinning_moves_means_and_covariances_by_the_whole_transform():
     rng = np.random.default_rng(0)
     with jax.enable_x64(True):
         gaussians = some_gaussians(rng)
-        first, second = (
-            transform.make(jnp.asarray(rng.normal(size=(12, 3, 3))), jnp.ones((12, 3)) * 0.3) for _ in "ab"
-        )
+        first, second = (transform.make(jnp.asarray(rng.normal(size=(12, 3, 3))), jnp.ones((12, 3)) * 0.3) for _ in "ab")
         moved = skin_gaussians(skin_gaussians(gaussians, first), second)
         both = second @ first
         linear = both[:, :3, :3]
@@ -91,9 +89,7 @@ def test_there_and_back():
 
 
 def test_bounds_are_met_within_the_margins():
-    edge = replace(
-        within_bounds(), opacities=jnp.ones(COUNT), colors=jnp.zeros((COUNT, 3)), scales=jnp.zeros((COUNT, 3))
-    )
+    edge = replace(within_bounds(), opacities=jnp.ones(COUNT), colors=jnp.zeros((COUNT, 3)), scales=jnp.zeros((COUNT, 3)))
     after = hg.constrain(hg.unconstrain(edge))
     np.testing.assert_allclose(after.opacities, 1 - OPACITY_MARGIN, atol=ROUNDING)
     np.testing.assert_allclose(after.colors, COLOR_MARGIN, atol=ROUNDING)
@@ -112,11 +108,7 @@ def test_optax_never_leaves_the_domain():
         updates, state = optimizer.update(jax.grad(loss)(parameters), state)
         parameters = optax.apply_updates(parameters, updates)
     after = hg.constrain(parameters)
-    assert (
-        ((after.opacities > 0) & (after.opacities <= 1)).all()
-        and (after.colors <= 1).all()
-        and (after.scales > 0).all()
-    )
+    assert ((after.opacities > 0) & (after.opacities <= 1)).all() and (after.colors <= 1).all() and (after.scales > 0).all()
 
 
 def test_deformations_are_refused():

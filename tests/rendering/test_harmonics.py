@@ -85,9 +85,7 @@ def test_a_scene_turned_with_its_camera_looks_the_same(count):
         moved_view = replace(view, cam_from_world=view.cam_from_world @ jnp.linalg.inv(move))
         colors = project(gaussians, view).added_colors
         np.testing.assert_allclose(project(moved, moved_view).added_colors, colors, atol=1e-10)
-        assert (
-            np.abs(project(replace(moved, harmonics=gaussians.harmonics), moved_view).added_colors - colors).max() > 0.1
-        )
+        assert np.abs(project(replace(moved, harmonics=gaussians.harmonics), moved_view).added_colors - colors).max() > 0.1
 
 
 def gradients(draw, gaussians, view):
@@ -124,9 +122,7 @@ def test_parameters_carry_them_and_other_counts_are_refused():
     gaussians = with_harmonics(random_gaussians(0, np.float32), 3)
     back = constrain(unconstrain(replace(gaussians, deformations=None)))
     np.testing.assert_array_equal(back.harmonics, gaussians.harmonics)
-    with pytest.raises(
-        ValueError, match=r"^harmonics: expected \(g, 3, 3\), \(g, 8, 3\) or \(g, 15, 3\), got \(g, 4, 3\)"
-    ):
+    with pytest.raises(ValueError, match=r"^harmonics: expected \(g, 3, 3\), \(g, 8, 3\) or \(g, 15, 3\), got \(g, 4, 3\)"):
         render(with_harmonics(gaussians, 4), camera(np.float32))
     with pytest.raises(ValueError, match=r"gaussians\.harmonics: expected shape \(32, k, 3\), got \(31, 3, 3\)"):
         render(replace(gaussians, harmonics=gaussians.harmonics[1:]), camera(np.float32))

@@ -254,9 +254,7 @@ def test_both_windings_are_drawn_alike():
 def test_edges_belong_to_the_face():
     vertices = np.array([[0.5, 0.5, 1], [4.5, 0.5, 1], [0.5, 4.5, 1]], np.float32)
     ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
-    expected = (
-        np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4
-    )  # the centres on both axes and on the diagonal too
+    expected = np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4  # the centres on both axes and on the diagonal too
     np.testing.assert_array_equal(ids == 0, expected)
 
 
@@ -345,9 +343,7 @@ def test_images_of_one_pixel_and_meshes_of_nothing():
 @pytest.mark.slow
 def test_vmap_equals_loop_and_steps_do_not_matter():
     vertices, faces = sphere()
-    cameras = orbit(
-        jnp.zeros(3), 3.0, jnp.asarray([0.0, 1.0, 4.0]), 0.3, intrinsics_from_fov(0.8, WIDTH, HEIGHT), WIDTH, HEIGHT
-    )
+    cameras = orbit(jnp.zeros(3), 3.0, jnp.asarray([0.0, 1.0, 4.0]), 0.3, intrinsics_from_fov(0.8, WIDTH, HEIGHT), WIDTH, HEIGHT)
     moved = jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]  # different numbers of steps
     batch = jax.vmap(lambda v, camera: draw(v, faces, camera))(moved, cameras)
     for i in range(3):
@@ -362,9 +358,7 @@ def test_interpolation_of_positions_is_the_seen_point():
     camera = some_camera(2)
     fragments = draw(vertices, faces, camera)
     background = jnp.asarray([5.0, 6.0, 7.0])
-    points = np.asarray(
-        interpolate_attributes(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64
-    )
+    points = np.asarray(interpolate_attributes(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64)
     covered = np.asarray(fragments.face_ids) >= 0
     np.testing.assert_array_equal(points[~covered], np.broadcast_to(background, points[~covered].shape))
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
@@ -377,9 +371,7 @@ def test_interpolation_of_positions_is_the_seen_point():
 def test_corner_attributes_have_their_own_numbering():
     fragments = draw(SQUARE, SQUARE_FACES, flat_camera())
     attributes = jnp.asarray([[1.0], [2.0]])
-    image = np.asarray(
-        interpolate_attributes(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1))
-    )[..., 0]
+    image = np.asarray(interpolate_attributes(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1)))[..., 0]
     np.testing.assert_allclose(image, np.asarray(fragments.face_ids) + 1, atol=1e-6)
 
 

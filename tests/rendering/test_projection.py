@@ -86,9 +86,7 @@ def test_determinant_of_a_needle_is_accurate_in_float32():
 def test_what_is_not_drawn_is_finite_and_passes_no_gradient():
     gaussians = replace(
         random_gaussians(2, np.float32),
-        means=jnp.asarray([[0, 0, -1], [0, 0, 0.01], [0, 0, 0], [1e20, 0, 0.02], [0, 0, 2]], jnp.float32)[
-            jnp.arange(32) % 5
-        ],
+        means=jnp.asarray([[0, 0, -1], [0, 0, 0.01], [0, 0, 0], [1e20, 0, 0.02], [0, 0, 2]], jnp.float32)[jnp.arange(32) % 5],
         scales=jnp.full((32, 3), 0.1, jnp.float32).at[jnp.arange(4, 32, 5)].set(1e15),
     )
     view = replace(camera(np.float32), cam_from_world=jnp.eye(4))

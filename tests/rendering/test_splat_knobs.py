@@ -103,10 +103,7 @@ def test_extent_cuts_whole_tiles_only():
         narrow = render(gaussians, view, knobs(radius_sigma=2.0))
         # at most the alpha of one splat beyond two deviations: no pixel here loses more
         assert 1e-3 < np.abs(narrow.rgb - exact.rgb).max() < 0.9 * np.exp(-2)
-        assert (
-            plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs
-            < plan_buffers(gaussians, view, SMALL).max_pairs
-        )
+        assert plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs < plan_buffers(gaussians, view, SMALL).max_pairs
 
 
 @pytest.mark.slow
@@ -121,9 +118,7 @@ def test_scale_draws_the_smaller_image():
         seen = np.asarray(ours.alpha) > 0
         low, high = half.depth[half.alpha > 0].min(), half.depth.max()
         assert (ours.depth[seen] >= low - FLOAT64).all() and (ours.depth[seen] <= high + FLOAT64).all()
-        assert (
-            plan_buffers(gaussians, view, knobs(scale=0.5)).max_pairs <= plan_buffers(gaussians, view, SMALL).max_pairs
-        )
+        assert plan_buffers(gaussians, view, knobs(scale=0.5)).max_pairs <= plan_buffers(gaussians, view, SMALL).max_pairs
 
 
 @pytest.mark.parametrize(("size", "count"), [(7, 3), (8, 4), (5, 1)])

@@ -142,9 +142,7 @@ def test_gradients_are_derivatives():
 
         def loss(arguments):
             r = tiled(*arguments)[0]
-            return sum(
-                float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True)
-            )
+            return sum(float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
 
         leaves, structure = jax.tree.flatten(arguments)
         slopes = jax.tree.leaves(gradients)
@@ -152,8 +150,7 @@ def test_gradients_are_derivatives():
         for i, slope in enumerate(slopes):
             direction = jnp.asarray(rng.normal(size=slope.shape))
             moved = [
-                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]])
-                for s in (step, -step)
+                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]]) for s in (step, -step)
             ]
             difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
             np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
@@ -188,14 +185,10 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
     gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
     ours = tiled(gaussians, view, background(np.float32))
     with jax.enable_x64(True):
-        exact = jax.tree.map(
-            lambda a: jnp.asarray(np.asarray(a, np.float64)), (gaussians, view, background(np.float32))
-        )
+        exact = jax.tree.map(lambda a: jnp.asarray(np.asarray(a, np.float64)), (gaussians, view, background(np.float32)))
         expected = reference(*exact)
     error = np.abs(np.asarray(ours[0].rgb) - np.asarray(expected[0].rgb)).max(axis=-1)
-    assert (
-        np.sum(error > bound(FLOAT32)) <= 2
-    )  # pixels at which alpha = 1/255, the stop or the order fell the other way
+    assert np.sum(error > bound(FLOAT32)) <= 2  # pixels at which alpha = 1/255, the stop or the order fell the other way
     assert error.max() < 2 / 255
     assert_close(ours[1], jax.tree.map(np.asarray, expected[1]), FLOAT32_GRADIENT)
     assert ours[0].rgb.dtype == np.float32

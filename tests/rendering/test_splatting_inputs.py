@@ -28,9 +28,7 @@ def test_a_batch_of_cameras_is_told_where_to_go():
 
 
 def test_a_single_camera_is_told_where_to_go():
-    with pytest.raises(
-        ValueError, match="render_views draws cameras with one leading axis, got a single camera: use render"
-    ):
+    with pytest.raises(ValueError, match="render_views draws cameras with one leading axis, got a single camera: use render"):
         render_views(scene(), camera(np.float32))
     nested = jax.tree.map(lambda leaf: leaf[None], BATCH)
     with pytest.raises(ValueError, match=r"got a batch \(1, 3\)"):
@@ -60,9 +58,7 @@ def test_wrong_values_of_gaussians_are_named(name, entry, words):
     array = jnp.broadcast_to(jnp.eye(3), (len(gaussians.means), 3, 3)) if array is None else array
     wrong = replace(gaussians, **{name: array.at[5, *[1] * (array.ndim - 1)].set(entry)})
     for draw in (lambda: render(wrong, camera(np.float32), CONFIG), lambda: render_views(wrong, BATCH, CONFIG)):
-        with pytest.raises(
-            ValueError, match=rf"^render: gaussians.{name}: {words}, but 1 of \d+ are not, the first at \[5"
-        ):
+        with pytest.raises(ValueError, match=rf"^render: gaussians.{name}: {words}, but 1 of \d+ are not, the first at \[5"):
             draw()
 
 

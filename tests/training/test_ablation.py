@@ -27,9 +27,7 @@ def trained(monkeypatch, tmp_path):
 
 def run(tmp_path, **how):
     nobody = how.pop("people", [])
-    return ablate(
-        how.pop("base", "tiny"), how.pop("variants", WITHOUT), out=tmp_path, people=nobody, **how, progress=False
-    )
+    return ablate(how.pop("base", "tiny"), how.pop("variants", WITHOUT), out=tmp_path, people=nobody, **how, progress=False)
 
 
 def test_differences_are_paired_by_seed(trained, tmp_path):

@@ -50,9 +50,7 @@ def test_masks_grow_and_shrink_by_squares(photos):
     _, masks = augment_photos(jax.random.key(1), *map(jnp.asarray, photos), dataclasses.replace(NOTHING, mask_pixels=2))
     possible = [photos[1][0]]
     for size in (3, 5):
-        possible += [
-            filter_(photos[1][0], size, mode="nearest") for filter_ in (ndimage.maximum_filter, ndimage.minimum_filter)
-        ]
+        possible += [filter_(photos[1][0], size, mode="nearest") for filter_ in (ndimage.maximum_filter, ndimage.minimum_filter)]
     which = [[np.array_equal(mask, other) for other in possible] for mask in np.asarray(masks)]
     assert np.all(np.sum(which, axis=1) == 1), "each mask is one of five"
     assert np.all(np.any(which, axis=0)), "each of the five occurs in 64 photos"
@@ -106,9 +104,7 @@ def test_the_person_is_turned_about_wherever_it_stands(example):
 
 def test_all_photos_of_an_example_have_the_same_wrong_body(example):
     views = example.inputs
-    off = augment_views(
-        jax.random.key(4), views, jnp.zeros(3), dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01)
-    )
+    off = augment_views(jax.random.key(4), views, jnp.zeros(3), dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01))
     for name in ("rotations", "translations"):
         change = np.asarray(getattr(off, name) - getattr(views, name))
         np.testing.assert_allclose(change, np.repeat(change[:1], len(change), 0), atol=ROUNDING)

@@ -177,9 +177,7 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     save_config(tmp_path, dataclasses.replace(tiny(), log_every=7))
     with pytest.raises(ValueError, match=r"started with steps = 60, not 5"):
         save_config(tmp_path, dataclasses.replace(tiny(), steps=5))
-    with pytest.raises(
-        ValueError, match="steps = 60, not 90"
-    ):  # not finished: its learning rate would change on the way
+    with pytest.raises(ValueError, match="steps = 60, not 90"):  # not finished: its learning rate would change on the way
         save_config(tmp_path, dataclasses.replace(tiny(), steps=90))
     (tmp_path / "checkpoints" / "60").mkdir(parents=True)
     with pytest.raises(ValueError, match="steps = 60, not 5"):

@@ -78,10 +78,7 @@ def test_a_loss_without_its_network_gives_way_and_says_so(caplog):
     with caplog.at_level(logging.WARNING):
         fitted = fitting_losses(config.published(), LossNetworks())
     assert (fitted.loss.perceptual, fitted.loss.lpips, fitted.loss.structural) == (0, 0, 0.2)
-    assert (
-        "no network is given for the loss perceptual and lpips" in caplog.text
-        and "structural dissimilarity" in caplog.text
-    )
+    assert "no network is given for the loss perceptual and lpips" in caplog.text and "structural dissimilarity" in caplog.text
     assert fitting_losses(config.small(), LossNetworks()) == config.small()
 
 

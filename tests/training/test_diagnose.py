@@ -99,9 +99,7 @@ PLANTED += [pytest.param(what, np.inf, marks=pytest.mark.slow) for what in IN_BA
 @pytest.mark.parametrize(("what", "value"), PLANTED)
 def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, what, value):
     path, index, stage = IN_BATCH[what]
-    diagnosis = diagnose_step(
-        init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG
-    )
+    diagnosis = diagnose_step(init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG)
     stored, computed = diagnosis.faults
     assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "batch", path, 1)
     assert stored.leaf.first == index[1:] and f"first at {list(index[1:])}" in str(diagnosis)
@@ -172,9 +170,7 @@ def test_networks_that_run_again_for_every_target_are_diagnosed(name):
     shapes = jax.eval_shape(lambda: init_state(config))
     example = Example(views(), views(seed=1))
     traced = functools.partial(inspect.unwrap(diagnose.observe_subject), config=config, networks=LossNetworks())
-    observed = jax.eval_shape(
-        traced, shapes.params, shapes.batch_stats, mapped_tube(small(name)), example, jax.random.key(0)
-    )[1]
+    observed = jax.eval_shape(traced, shapes.params, shapes.batch_stats, mapped_tube(small(name)), example, jax.random.key(0))[1]
     found = {parameter for stage in observed for parameter in stage.gradients}
     assert found == {parameter for parameter, _ in inexact_leaves(shapes.params)}
 
@@ -291,9 +287,7 @@ class Spoilt:
 @pytest.mark.slow
 def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
     def source(at):
-        make = lambda config: CaptureSource(
-            cache, config.views, config.model.conventions.image_size, config.target_size
-        )
+        make = lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
         return lambda config: Spoilt(make(config), at)
 
     cache = CaptureCache(captures, body)
@@ -312,9 +306,7 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
 def fresh(monkeypatch):
     """`observe_subject` traced anew, after something was exchanged; quick to compile."""
     options = {"xla_backend_optimization_level": 0}
-    function = functools.partial(
-        inspect.unwrap(diagnose.observe_subject)
-    )  # another one, or it would come from the cache
+    function = functools.partial(inspect.unwrap(diagnose.observe_subject))  # another one, or it would come from the cache
     traced = jax.jit(function, static_argnames="config", compiler_options=options)
     monkeypatch.setattr(diagnose, "observe_subject", traced)
 
@@ -379,8 +371,6 @@ def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config), batch, body, config)
     _, metrics = train_step(init_state(config), batch, body, config)
-    assert whole.fault is None and {"encoder.transformer.block_3", "encoder", "loss"} <= {
-        stage.name for stage in whole.stages
-    }
+    assert whole.fault is None and {"encoder.transformer.block_3", "encoder", "loss"} <= {stage.name for stage in whole.stages}
     assert whole.loss == pytest.approx(float(metrics["loss"]), rel=bound(FLOAT32))
     assert whole.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=1e-3)  # without the compiler's fusions

@@ -139,9 +139,7 @@ def test_what_was_dropped_is_explained(body, captures, variables, tmp_path, monk
     monkeypatch.setattr(loop, "validate", lambda *_: (numbers, [np.zeros((2, 32, 32, 3))]))
     options = {"variables": variables, "validation": captures[2:], "stop_at": 2}
     train(CONFIG, body, captures[:2], tmp_path, **options)
-    assert f"dropped_tokens 1 ({loop.DROPPED['dropped_tokens']}), overflow 0" in " ".join(
-        "".join(capsys.readouterr()).split()
-    )
+    assert f"dropped_tokens 1 ({loop.DROPPED['dropped_tokens']}), overflow 0" in " ".join("".join(capsys.readouterr()).split())
 
 
 def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypatch):
@@ -175,9 +173,7 @@ def test_a_broken_folder_is_named_and_logged(body, captures, variables, tmp_path
 
 
 @pytest.mark.slow
-def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(
-    body, captures, variables, tmp_path, whole, same
-):
+def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(body, captures, variables, tmp_path, whole, same):
     asked = []
 
     def make(config):

@@ -38,9 +38,7 @@ def shrunk(name):
         upsampler=upsampler,
     )
     reader = dataclasses.replace(parts.reader, output_width=None if upsampler is None else 8)
-    model = config.model.with_parts(
-        encoder=encoder, reader=reader, decoder=dataclasses.replace(parts.decoder, hidden=16)
-    )
+    model = config.model.with_parts(encoder=encoder, reader=reader, decoder=dataclasses.replace(parts.decoder, hidden=16))
     model = model.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
     return dataclasses.replace(
         config,

@@ -25,9 +25,7 @@ def state_of(out, step):
 
 
 def largest_difference(a, b):
-    return max(
-        float(np.abs(np.asarray(x) - np.asarray(y)).max()) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True)
-    )
+    return max(float(np.abs(np.asarray(x) - np.asarray(y)).max()) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))
 
 
 @pytest.mark.slow

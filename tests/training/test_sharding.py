@@ -35,9 +35,7 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
 
 def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
     """Four devices, two by two, as nested maps with the names of a mesh's axes."""
-    gradients = jnp.asarray(
-        np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
-    )  # data, fsdp, rows, columns
+    gradients = jnp.asarray(np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32)  # data, fsdp, rows, columns
     mesh = SimpleNamespace(size=4)
     parts = lambda spec: jax.vmap(
         jax.vmap(lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"], axis_name="fsdp"),

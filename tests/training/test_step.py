@@ -58,9 +58,7 @@ def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):
     assert np.mean(jax.tree.leaves(moved)) > 0.9  # biases that only unused units see may stay
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.any(a != b)), state.batch_stats, before.batch_stats))
     weights = dataclasses.asdict(CONFIG.loss)
-    expected = sum(
-        weights[name] * float(metrics[name]) for name in ("squared", "structural", "silhouette", "tightness")
-    )
+    expected = sum(weights[name] * float(metrics[name]) for name in ("squared", "structural", "silhouette", "tightness"))
     assert float(metrics["loss"]) == pytest.approx(expected, rel=bound(FLOAT32))
     assert float(metrics["grad_norm"]) > 0
     assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
@@ -152,9 +150,7 @@ def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source, variables
     singles = [one(0), one(1)]
     for position in (0, 1, 2):  # loss, gradients, batch statistics
         mean = jax.tree.map(lambda a, b: (a + b) / 2, *(x[position] for x in singles))
-        close = jax.tree.map(
-            lambda a, b: np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9, both[position], mean
-        )
+        close = jax.tree.map(lambda a, b: np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9, both[position], mean)
         assert jax.tree.all(close)
     with pytest.raises(ValueError, match="2 subjects per device cannot be divided into microbatches of 3"):
         gradients(batch, keys, dataclasses.replace(CONFIG, microbatch_size=3))
@@ -172,17 +168,14 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
     with jax.enable_x64(True):
         params, body, batch = jax.tree.map(double, (variables["params"], body, batch))
         results = [
-            batch_gradients(params, {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size))
-            for size in (1, 2)
+            batch_gradients(params, {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size)) for size in (1, 2)
         ]
     assert float(results[1][0]) == pytest.approx(float(results[0][0]), rel=FLOAT64)
     for a, b in zip(*(jax.tree.leaves(result[1]) for result in results), strict=True):
         assert np.linalg.norm(a - b) <= FLOAT64 * np.linalg.norm(b) + 1e-12
 
 
-WITH_NETWORKS = dataclasses.replace(
-    CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25, vgg16=0.1)
-)
+WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25, vgg16=0.1))
 
 
 @pytest.mark.slow
@@ -206,9 +199,7 @@ def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype)
     state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
     weights = dataclasses.asdict(config.loss)
     names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips", "vgg16")
-    assert float(metrics["loss"]) == pytest.approx(
-        sum(weights[x] * float(metrics[x]) for x in names), rel=bound(FLOAT32)
-    )
+    assert float(metrics["loss"]) == pytest.approx(sum(weights[x] * float(metrics[x]) for x in names), rel=bound(FLOAT32))
     assert all(float(metrics[name]) > 0 for name in ("perceptual", "lpips", "vgg16"))
     assert int(state.opt_state.skipped) == int(state.opt_state.nonfinite) == 0
     first = float(metrics["perceptual"])
@@ -304,9 +295,7 @@ def test_a_gradient_is_the_mean_over_subjects_whatever_the_microbatch(monkeypatc
     monkeypatch.setattr(step, "subject_loss", loss)
     weights, keys = jnp.asarray([1.0, 2.0, 4.0, 9.0]), jax.random.split(jax.random.key(0), 4)
     config = dataclasses.replace(CONFIG, microbatch_size=size)
-    value, gradients, _, metrics = inspect.unwrap(step.local_gradients)(
-        {"x": jnp.asarray(3.0)}, {}, None, weights, keys, config
-    )
+    value, gradients, _, metrics = inspect.unwrap(step.local_gradients)({"x": jnp.asarray(3.0)}, {}, None, weights, keys, config)
     assert float(gradients["x"]) == 4.0 and float(value) == float(metrics["loss"]) == 12.0  # means of weights, times 3
     assert float(metrics["dropped_tokens"]) == float(metrics["overflow"]) == 16.0  # sums
 

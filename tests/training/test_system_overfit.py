@@ -36,8 +36,6 @@ def test_a_system_learns_one_person(name, body, captures):
     assert history[-1]["skipped"] == history[-1]["dropped_tokens"] == history[-1]["overflow"] == 0
     # a half of the steps has random backgrounds, before which errors are others
     mean = lambda steps, term: float(np.mean([metrics[term] for metrics in steps]))
-    first, last = (
-        {term: mean(steps, term) for term in ("squared", "silhouette")} for steps in (history[:10], history[-10:])
-    )
+    first, last = ({term: mean(steps, term) for term in ("squared", "silhouette")} for steps in (history[:10], history[-10:]))
     print(name, first, last)
     assert last["squared"] < 0.8 * first["squared"] and last["silhouette"] < 0.8 * first["silhouette"]

@@ -95,7 +95,5 @@ def write_subject(path, body, seed):
 
 def batch_of(body, captures, config, step=0):
     size = config.model.conventions.image_size
-    source = Loader(
-        CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size
-    )
+    source = Loader(CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size)
     return source.batch_at(step)

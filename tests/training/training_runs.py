@@ -17,9 +17,7 @@ def worker():
 
 def run(*arguments):
     """One process, to its end."""
-    finished = subprocess.run(
-        [*worker(), *map(str, arguments)], capture_output=True, text=True, timeout=SECONDS, check=False
-    )
+    finished = subprocess.run([*worker(), *map(str, arguments)], capture_output=True, text=True, timeout=SECONDS, check=False)
     assert finished.returncode == 0, finished.stdout + finished.stderr
 
 

@@ -141,9 +141,7 @@ def test_a_browser_sees_the_person_and_the_next_one(person):
         view.show(person)
         browser.driver.get(view.url)
         assert wait_for(browser, 0)
-        near = browser.run(
-            inside + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return kept"
-        )
+        near = browser.run(inside + "const kept = page.state(); kept.orbit.distance *= 0.8; page.restore(kept); return kept")
         view.show(blue)
         assert wait_for(browser, 2) and share(browser, 0) < 0.01
         assert browser.run(inside + "return page.state()")["orbit"] == near["orbit"]  # as people had turned it

@@ -95,9 +95,7 @@ def test_colors_beyond_one_and_flat_gaussians_are_kept():
 
 def test_the_page_adds_no_more_than_the_scales_lack():
     avatar = small_avatar()
-    refined = replace(
-        avatar, gaussians=replace(avatar.gaussians, low_pass=jnp.full_like(avatar.gaussians.opacities, 0.004))
-    )
+    refined = replace(avatar, gaussians=replace(avatar.gaussians, low_pass=jnp.full_like(avatar.gaussians.opacities, 0.004)))
     drawn = [packing.pack(x).header["splatting"] for x in (avatar, refined)]
     assert [x["eps2d"] for x in drawn] == [EPS2D, MIP_EPS2D]
     assert [x["low_pass"] for x in drawn] == pytest.approx([0.0, 0.004])
@@ -120,9 +118,7 @@ def test_the_largest_weights_come_first_and_sum_to_one(joints):
 
 def test_a_motion_is_kept_to_a_ten_thousandth_of_a_radian():
     rng = np.random.default_rng(0)
-    motion = Motion(
-        jnp.asarray(rng.uniform(-3, 3, (5, 3, 3)), jnp.float32), jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
-    )
+    motion = Motion(jnp.asarray(rng.uniform(-3, 3, (5, 3, 3)), jnp.float32), jnp.asarray(rng.normal(size=(5, 3)), jnp.float32))
     packed = packing.pack(small_avatar(), motion)
     arrays, about = packing.unpack(packed), packed.header["motion"]
     assert about["frames"] == 5 and about["fps"] == 30

@@ -93,9 +93,7 @@ def skeletons():
         files[f"turned pelvis {seed}"] = write_bvh(source, poses(CMU), CMU, moves=moves, pelvis=turns)
     spaced = {ours: f"Bip 01 \t {theirs.replace('Left', 'L  ').replace('Right', 'R ')}" for ours, theirs in CMU.items()}
     files["spaces"] = write_bvh(source, poses(CMU), spaced, moves=moves)
-    files["spaces, braces, lines of Windows"] = (
-        files["spaces"].replace("\n\t", " \n").replace("\r", "").replace("\n", "\r\n")
-    )
+    files["spaces, braces, lines of Windows"] = files["spaces"].replace("\n\t", " \n").replace("\r", "").replace("\n", "\r\n")
     unity = {
         "UpLeg": "UpperLeg",
         "Leg": "LowerLeg",
@@ -119,9 +117,7 @@ def skeletons():
         files[kind] = write_bvh(source, poses(names), names, moves=moves)
     short = {ours: theirs for ours, theirs in LAFAN.items() if not ours.endswith("_foot")}
     files["no toes, no standing"] = write_bvh(source, poses(short), short, frames_along_bones(source), moves)
-    files["odd names"] = (
-        files["A-pose"].replace("JOINT Head", "JOINT constructor").replace("JOINT Neck", "JOINT __proto__")
-    )
+    files["odd names"] = files["A-pose"].replace("JOINT Head", "JOINT constructor").replace("JOINT Neck", "JOINT __proto__")
     for kind in ("walking", "crawling", "lying on the back", "handstand"):
         rotations, translations = motions()[kind]
         body = rotations * np.isin(JOINT_NAMES, list(CMU))[:, None]
@@ -149,8 +145,7 @@ def array_files():
         "AIST++ scaled": {"smpl_poses": poses[:, :72], "smpl_trans": 93 * trans, "smpl_scaling": np.asarray([93.0])},
         "parts": parts | hands,
         "parts of SMPL": parts | {"body_pose": np.pad(parts["body_pose"], ((0, 0), (0, 6)))},
-        "matrices": {key: matrices(x).reshape(4, -1, 3, 3) for key, x in parts.items() if key != "transl"}
-        | {"transl": trans},
+        "matrices": {key: matrices(x).reshape(4, -1, 3, 3) for key, x in parts.items() if key != "transl"} | {"transl": trans},
         "no places": {key: x for key, x in parts.items() if key != "transl"},
         "smplcodec": {
             "bodyPose": poses[:, :66].reshape(4, 22, 3),
@@ -164,9 +159,7 @@ def array_files():
     for kind, (rotations, translations) in motions().items():
         for up, turn in UP.items():
             for heading in (90,):
-                turned, moved = in_world(
-                    rotations, translations, turn * Rotation.from_euler("y", heading, degrees=True)
-                )
+                turned, moved = in_world(rotations, translations, turn * Rotation.from_euler("y", heading, degrees=True))
                 flat = turned.reshape(len(turned), -1)
                 name = f"{kind}, {up} up, heading {heading}"
                 files[f"AMASS: {name}"] = {"poses": flat, "trans": moved, "mocap_framerate": FPS}
@@ -206,9 +199,7 @@ def test_the_page_reads_arrays_as_python_does(tmp_path, caplog):
 
 
 POSES = {"poses": np.zeros((2, 66)), "trans": np.zeros((2, 3))}
-HEAD = (
-    "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
-)
+HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
 BAD = {
     "rate": ("a.npz", npz(**POSES, fps=np.inf), "expected a positive number of frames per second, got Infinity"),
     "no rate": ("a.npz", npz(**POSES), "key mocap_framerate: missing"),
@@ -254,9 +245,7 @@ def test_the_page_refuses_what_it_cannot_draw():
 @pytest.mark.parametrize("name", ["constructor", "__proto__", "toString"])
 def test_an_avatar_may_have_joints_of_any_name(name):
     rest = np.concatenate([shipped_joints(), [[0, 0.5, 0.1]]])
-    (page,) = page_reads(
-        [("dance.bvh", skeletons()["A-pose"].encode())], (*JOINT_NAMES, name), (*PARENTS, INDEX["head"]), rest
-    )
+    (page,) = page_reads([("dance.bvh", skeletons()["A-pose"].encode())], (*JOINT_NAMES, name), (*PARENTS, INDEX["head"]), rest)
     (usual,) = page_reads([("dance.bvh", skeletons()["A-pose"].encode())])
     np.testing.assert_allclose(np.asarray(page["quats"])[:, :55], usual["quats"], atol=EXACT)
     np.testing.assert_allclose(np.abs(np.asarray(page["quats"])[:, 55, 0]), 1, atol=EXACT)  # as its parent

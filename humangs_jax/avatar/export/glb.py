@@ -87,9 +87,7 @@ def read_glb(data: bytes) -> Gaussians:
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
 
 
-def _part(
-    content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"]
-) -> Gaussians:
+def _part(content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"]) -> Gaussians:
     def array(name: str) -> np.ndarray:
         if name not in attributes:
             raise Refused(f"{name}: missing")
@@ -105,6 +103,4 @@ def _part(
     gaussians = loaded(arrays)
     if np.array_equal(place, np.eye(4)):
         return gaussians
-    return factored(
-        skin_gaussians(gaussians, jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4)))
-    )
+    return factored(skin_gaussians(gaussians, jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4))))

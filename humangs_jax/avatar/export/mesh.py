@@ -114,9 +114,7 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
     return weights.reshape(-1, each, weights.shape[1]).mean(axis=1)
 
 
-def skin_colors(
-    avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]
-) -> Float[np.ndarray, "p 3"]:
+def skin_colors(avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
     """What the Gaussians show at points of the skin to someone who looks along the normals, from outside.
 
     On the line x(t) = p + t n, a Gaussian of precision A and mean m is densest at t = n.A(m - p) / n.A n and there has the alpha
@@ -152,9 +150,7 @@ def skin_colors(
 # glTF -----------------------------------------------------------------------------------------------------------------
 
 
-def write_animation(
-    path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
-) -> None:
+def write_animation(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str) -> None:
     """All of a motion in one `.glb`, see `write_mesh_glb`."""
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
 
@@ -257,15 +253,9 @@ def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> 
     rotations = np.asarray(motion.rotations)
     quats = _continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
     root = avatar.parents.index(-1)
-    tracks = [
-        (j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]])
-        for j in range(rotations.shape[1])
-        if rotations[:, j].any()
-    ]
+    tracks = [(j, "rotation", "VEC4", quats[:, j][:, [1, 2, 3, 0]]) for j in range(rotations.shape[1]) if rotations[:, j].any()]
     tracks.append((root, "translation", "VEC3", np.asarray(motion.translations) + np.asarray(avatar.rest_joints)[root]))
-    samplers = [
-        {"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"} for *_, kind, values in tracks
-    ]
+    samplers = [{"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"} for *_, kind, values in tracks]
     channels = [{"sampler": i, "target": {"node": node, "path": path}} for i, (node, path, *_) in enumerate(tracks)]
     return {"name": name, "channels": channels, "samplers": samplers}
 

@@ -83,17 +83,13 @@ def read_spz(data: bytes) -> Gaussians:
         header = file.read(HEADER.size).ljust(HEADER.size, b"\0")
         magic, version, count, degree, bits, flags, _ = HEADER.unpack(header)
         if magic != SPZ_MAGIC or version not in (2, SPZ_VERSION) or degree >= len(COUNTS):
-            raise Refused(
-                f"expected .spz of version 2 or 3 and degree 0 to 3, got version {version} and degree {degree}"
-            )
+            raise Refused(f"expected .spz of version 2 or 3 and degree 0 to 3, got version {version} and degree {degree}")
         check_limit("gaussians", count, "Gaussians")
         widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * COUNTS[degree])
         check_unpacked(len(data), size := count * sum(widths))
         content = file.read(size + 1)
     if len(content) < size or (len(content) > size and not flags & MORE_BEHIND):
-        raise Refused(
-            f"expected {count:,} Gaussians in {size:,} bytes, got {'more' if len(content) > size else 'less'}"
-        )
+        raise Refused(f"expected {count:,} Gaussians in {size:,} bytes, got {'more' if len(content) > size else 'less'}")
     starts = itertools.accumulate(widths, initial=0)
     parts = [
         np.frombuffer(content, "u1", count * width, count * start).reshape(count, width)

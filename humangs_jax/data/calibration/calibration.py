@@ -172,9 +172,7 @@ def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel
     return dataclasses.replace(calibration, cameras=cameras, observations=observations, up="+y", pixel_centers="half")
 
 
-def _convert(
-    camera: CalibratedCamera, scale: float | int, turn: Float[np.ndarray, "3 3"], shift: float
-) -> CalibratedCamera:
+def _convert(camera: CalibratedCamera, scale: float | int, turn: Float[np.ndarray, "3 3"], shift: float) -> CalibratedCamera:
     K, pose = camera.K.copy(), camera.cam_from_world.copy()
     K[:2, 2] += shift
     pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
@@ -196,9 +194,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
     """Width and height in whole pixels."""
     width, height = floats(value, file, field, (2,)).tolist()
-    if not (
-        width.is_integer() and height.is_integer() and min(width, height) > 0 and max(width, height) <= limits().side
-    ):
+    if not (width.is_integer() and height.is_integer() and min(width, height) > 0 and max(width, height) <= limits().side):
         raise CaptureError(file, field, f"expected width and height in pixels, got {width:g} x {height:g}")
     return int(width), int(height)
 

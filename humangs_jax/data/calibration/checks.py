@@ -111,9 +111,7 @@ def axes_meeting(
     if np.linalg.eigvalsh(normal)[0] < NEARLY_PARALLEL:
         return None, None
     point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centers) / len(poses))
-    return ((point - centers) * axes).sum(axis=-1), np.linalg.norm(
-        np.einsum("vij,vj->vi", across, point - centers), axis=-1
-    )
+    return ((point - centers) * axes).sum(axis=-1), np.linalg.norm(np.einsum("vij,vj->vi", across, point - centers), axis=-1)
 
 
 def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:

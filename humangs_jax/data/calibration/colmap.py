@@ -72,9 +72,7 @@ def _read_cameras(file: Path) -> dict[str, CalibratedCamera]:
             )
         where, names = f"line {number}", PARAMETERS[model]
         if len(values) != 2 + len(names):
-            raise CaptureError(
-                file, where, f"{model}: expected WIDTH HEIGHT {' '.join(names)}, got {len(values)} numbers"
-            )
+            raise CaptureError(file, where, f"{model}: expected WIDTH HEIGHT {' '.join(names)}, got {len(values)} numbers")
         numbers = _numbers(values, file, where)
         lenses[camera_id] = _lens(model, numbers[:2], numbers[2:], file, where)
     return lenses
@@ -180,9 +178,7 @@ def _binary_cameras(file: Path) -> dict[str, CalibratedCamera]:
             f"camera {i}",
             (len(PARAMETERS[models[model]]),),
         )
-        lenses[str(camera_id)] = _lens(
-            models[model], (float(width), float(height)), values.tolist(), file, f"camera {i}"
-        )
+        lenses[str(camera_id)] = _lens(models[model], (float(width), float(height)), values.tolist(), file, f"camera {i}")
     return lenses
 
 

@@ -135,9 +135,7 @@ def import_cameras(
     _check_folders(source, images, masks, out, overwrite)
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
         calibration = read_calibration(source, lambda name: photo_size(photo_of(images, name, source)))
-        return import_calibration(
-            calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers
-        )
+        return import_calibration(calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers)
 
 
 def import_calibration(
@@ -202,9 +200,7 @@ def import_calibration(
     )
 
 
-def _named_masks(
-    calibration: Calibration, photos: Sequence[Photo], masks: Path | None
-) -> tuple[str | None, str | None]:
+def _named_masks(calibration: Calibration, photos: Sequence[Photo], masks: Path | None) -> tuple[str | None, str | None]:
     """A note about masks that the calibration names, and a warning about those that the capture does not get."""
     if calibration.mask_key is None:
         return None, None
@@ -217,9 +213,7 @@ def _named_masks(
     return None, f"{named}: no such mask, {first}: imported without masks"
 
 
-def _check_options(
-    scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None
-) -> None:
+def _check_options(scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
     if not 0 < scale < float("inf"):
         raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
     for name, word, known in (
@@ -238,9 +232,7 @@ def _check_folders(source: Path, images: Path, masks: Path | None, out: Path, ov
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
     check_place(out, overwrite)
-    inside = lambda path: Path(os.path.realpath(path)).is_relative_to(
-        os.path.realpath(out)
-    )  # resolve() raises for loops
+    inside = lambda path: Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out))  # resolve() raises for loops
     for path in (source, images, masks):
         if path is not None and inside(path):
             raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
@@ -300,9 +292,7 @@ def _write(
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
     straight = all(camera.distortion is None for camera in calibration.cameras)
-    rewrites = [
-        turn.rewrites or turn.size != canvas or _of_phones(photo) for photo, turn in zip(photos, turns, strict=True)
-    ]
+    rewrites = [turn.rewrites or turn.size != canvas or _of_phones(photo) for photo, turn in zip(photos, turns, strict=True)]
     changed = not straight or any(rewrites)
     transparent = changed and any(_is_transparent(photo.image) for photo in photos)
     straight = straight and not transparent
@@ -380,9 +370,7 @@ def _rewrite(
     return files, bool(at_rim)
 
 
-def _padded(
-    pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
-) -> Float[np.ndarray, "height width *c"]:
+def _padded(pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float) -> Float[np.ndarray, "height width *c"]:
     """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added are opaque white."""
     (height, width), (right, below) = pixels.shape[:2], canvas
     margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))

@@ -10,9 +10,7 @@ KEYS = {"K": "K", "distCoef": "dist", "R": "R", "t": "T", "T": "T", "resolution"
 
 def recognizes(source: Source) -> bool:
     """Whether a file has a list of cameras."""
-    return (
-        isinstance(source.json, dict) and isinstance(source.json.get("cameras"), list) and "frames" not in source.json
-    )
+    return isinstance(source.json, dict) and isinstance(source.json.get("cameras"), list) and "frames" not in source.json
 
 
 def read(source: Source, format: CameraFormat) -> Calibration:
@@ -21,8 +19,6 @@ def read(source: Source, format: CameraFormat) -> Calibration:
     for i, entry in enumerate(source.json["cameras"]):
         expect(entry, dict, file, f"cameras[{i}]")
         values = {ours: entry[theirs] for theirs, ours in KEYS.items() if theirs in entry}
-        field = lambda name, i=i: (
-            f"cameras[{i}].{ {'T': 't', 'dist': 'distCoef', 'imgSize': 'resolution'}.get(name, name) }"
-        )
+        field = lambda name, i=i: f"cameras[{i}].{ {'T': 't', 'dist': 'distCoef', 'imgSize': 'resolution'}.get(name, name) }"
         cameras.append(one_camera(str(entry.get("name", i)), values, values, (file, file), field))
     return source.calibration(format, cameras)

@@ -55,9 +55,7 @@ def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
     found = {}
     for key, value in content.items():
         if isinstance(value, dict) and key == "cameras":
-            found |= {
-                f"cameras.{name}": expect(each, dict, source.path, f"cameras.{name}") for name, each in value.items()
-            }
+            found |= {f"cameras.{name}": expect(each, dict, source.path, f"cameras.{name}") for name, each in value.items()}
         elif isinstance(value, dict) and ("matrix" in value or "rotation" in value):
             found[key] = value
     return found

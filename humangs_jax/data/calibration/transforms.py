@@ -95,9 +95,7 @@ def _frame_camera(
     try:
         cam_from_world = CONVENTIONS[WORLD_FROM_CAM_OPENGL](pose)
     except np.linalg.LinAlgError:
-        raise CaptureError(
-            file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one"
-        ) from None
+        raise CaptureError(file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one") from None
     return CalibratedCamera(name, K, cam_from_world, width, height, distortion)
 
 
@@ -172,9 +170,7 @@ def _find_moments(frames: Sequence[Mapping[str, Any]], file: Path) -> tuple[list
     return ranks, count if cameras is not None or count < len(frames) else None
 
 
-def _values(
-    frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
-) -> tuple[str, list[str | float]] | None:
+def _values(frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path) -> tuple[str, list[str | float]] | None:
     """The first key that an image has, and its value in all of them; None if there is none."""
     key = next((key for key in keys if any(key in frame for frame in frames)), None)
     if key is None:
@@ -223,9 +219,7 @@ def _refuse_unknown_moments(owner: str, owners: Sequence[Any], file: Path) -> No
     same = f"the {owner} {first:g}" if isinstance(first, float) else f"the {owner} {first}"
     which = same if owner else "the same camera pose"
     problem = f"frames[{rows[0]}] and frames[{rows[1]}] have {which}, so they show different moments"
-    raise CaptureError(
-        file, "frames", f"{problem}: expected timestep_index or time in each frame to tell which are of one"
-    )
+    raise CaptureError(file, "frames", f"{problem}: expected timestep_index or time in each frame to tell which are of one")
 
 
 def _check_taken_once(owner: str, owners: Sequence[Any], key: str, ranks: Sequence[int], file: Path) -> None:

@@ -35,9 +35,7 @@ def find_videos(folder: Path) -> dict[str, Path]:
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
             if path.stem in found:
-                raise CaptureError(
-                    path, "", f"camera {path.stem} has {found[path.stem].name} already: expected one video"
-                )
+                raise CaptureError(path, "", f"camera {path.stem} has {found[path.stem].name} already: expected one video")
             found[path.stem] = path
     return found
 
@@ -51,18 +49,14 @@ def photos_of_videos(
     Arguments: every: frame step, from frame 0. most: photos of a camera, None: all.
     Raises: CaptureError naming the video, also if every or most ask something of folders that hold none.
     """
-    videos = {
-        kind: find_videos(folder) for kind, folder in (("images", images), ("masks", masks)) if folder is not None
-    }
+    videos = {kind: find_videos(folder) for kind, folder in (("images", images), ("masks", masks)) if folder is not None}
     if not any(videos.values()):
         if every != 1 or most is not None:
             raise CaptureError(images, "", f"no video ({', '.join(SUFFIXES)}): frames can be chosen of videos only")
         yield images, masks
         return
     if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
-        raise CaptureError(
-            masks or images, lonely[0], "expected a video of photos and one of masks, or folders of both"
-        )
+        raise CaptureError(masks or images, lonely[0], "expected a video of photos and one of masks, or folders of both")
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
         folders: dict[str, Path | None] = {"images": images, "masks": masks}
@@ -230,9 +224,7 @@ def choose_frames(sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarr
         raise Refused(f"none of its {len(sharpness):,} frames shows anything: expected a video of a person")
     windows = np.array_split(shown, min(len(shown), WINDOWS))
     offered = np.asarray([window[np.argmax(sharpness[window])] for window in windows])
-    worth = np.minimum(
-        1, sharpness[offered] / np.median(sharpness[offered])
-    )  # of a window that is blurred as a whole: less
+    worth = np.minimum(1, sharpness[offered] / np.median(sharpness[offered]))  # of a window that is blurred as a whole: less
     chosen, new = [int(np.argmax(worth))], np.full(len(offered), np.inf)
     while len(chosen) < min(most, len(offered)):
         apart = thumbnails[offered] - thumbnails[offered[chosen[-1]]]

@@ -52,9 +52,7 @@ class FileBody:
     def hands(self) -> HandBasis:
         """Mean and components of its hand poses. Raises: CaptureError for the package's own body, which has none."""
         if self.file == DEFAULT_BODY:
-            problem = (
-                "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model for body"
-            )
+            problem = "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model for body"
             raise CaptureError("body", DEFAULT_BODY, problem)
         return load_hands(self.file)
 
@@ -122,9 +120,7 @@ def coefficients(
     something else than SMPL-X's.
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
-        problem = (
-            f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
-        )
+        problem = f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
         raise CaptureError(file, "betas", problem)
     of_expression = [i for i, name in enumerate(body.shape_names) if name.startswith("expression_")]
     total = body.shape_directions.shape[-1]
@@ -139,9 +135,7 @@ def coefficients(
     return found
 
 
-def turned(
-    parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]
-) -> BodyParameters:
+def turned(parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]) -> BodyParameters:
     """The same poses in a world that a rigid transform moved. pelvis: (3,) its place in the T-pose of the person."""
     from scipy.spatial.transform import Rotation
 
@@ -153,9 +147,7 @@ def turned(
     return BodyParameters(parameters.betas, rotations, translations)
 
 
-def recover_shape(
-    body: FileBody, rest: Float[np.ndarray, "n 3"], file: object
-) -> tuple[float, Float[np.ndarray, " s"]]:
+def recover_shape(body: FileBody, rest: Float[np.ndarray, "n 3"], file: object) -> tuple[float, Float[np.ndarray, " s"]]:
     """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template + directions betas).
 
     Where all vertices do not fit, the hands are left out, which the release bends by accident.
@@ -163,9 +155,7 @@ def recover_shape(
     """
     template = body.arrays[0]
     if len(rest) != len(template):
-        problem = (
-            f"{len(rest)} vertices, but body '{body.model.name}' has {len(template)}: expected the model of the arrays"
-        )
+        problem = f"{len(rest)} vertices, but body '{body.model.name}' has {len(template)}: expected the model of the arrays"
         raise CaptureError(file, "v_cano", problem)
     for solve, columns, kept in _shape_solvers(body):
         solution = solve @ rest[kept].reshape(-1)

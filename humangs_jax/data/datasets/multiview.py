@@ -254,9 +254,7 @@ def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Su
     cameras = read_cameras(folder / layout.calibration)
     place = lambda part, camera: folder / part.replace("NAME", camera.name)
     places = [(place(layout.photos, camera), place(layout.masks, camera)) for camera in cameras]
-    return folder_subject(
-        folder, cameras, places, read_parameters(folder / PARAMETERS, body), read_missing(folder / MISSING)
-    )
+    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body), read_missing(folder / MISSING))
 
 
 find_thuman4, open_thuman4 = (functools.partial(do, THUMAN4) for do in (find_subjects, open_subject))

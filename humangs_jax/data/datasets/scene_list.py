@@ -211,9 +211,7 @@ def _view_size(file: Path, name: str, view: SceneFrame) -> tuple[int, int]:
     return read_checked(image_size, _inside(file, name, view.image))
 
 
-def _read_view(
-    file: Path, name: str, view: SceneFrame
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:
+def _read_view(file: Path, name: str, view: SceneFrame) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:
     path = _inside(file, name, view.image)
     image, alpha = read_checked(read_image, path)
     if view.mask is not None:
@@ -266,9 +264,7 @@ def write_arrays(
 ) -> None:
     """The npz of a frame."""
     arrays = {"v_posed": posed, "v_cano": rest, "joint_transforms": joint_transforms}
-    write_npz(
-        path, {name: array.astype(np.float32) for name, array in arrays.items()} | {"faces": faces.astype(np.int32)}
-    )
+    write_npz(path, {name: array.astype(np.float32) for name, array in arrays.items()} | {"faces": faces.astype(np.int32)})
 
 
 def write_list(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:

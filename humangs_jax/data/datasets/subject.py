@@ -94,9 +94,7 @@ class Subject:
         images, masks = zip(*found, strict=True)
         return np.stack(images), np.stack(masks)
 
-    def capture(
-        self, views: Sequence[int] | Int[np.ndarray, " any"], body: FileBody, size: int = STORED_SIZE
-    ) -> Capture:
+    def capture(self, views: Sequence[int] | Int[np.ndarray, " any"], body: FileBody, size: int = STORED_SIZE) -> Capture:
         """These views as a `Capture`, to reconstruct and to animate; its poses are those of the frames that are seen.
 
         Raises: ValueError naming file and field.

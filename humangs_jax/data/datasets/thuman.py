@@ -131,9 +131,7 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     for side, hand in zip(("left", "right"), hands, strict=True):
         if len(hand) not in lengths or len(hand) != length:
             wanted = " or ".join(map(str, lengths))
-            raise CaptureError(
-                file, f"{side}_hand_pose", f"expected {wanted} numbers beside {of_kind}, got {len(hand)}"
-            )
+            raise CaptureError(file, f"{side}_hand_pose", f"expected {wanted} numbers beside {of_kind}, got {len(hand)}")
     kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
     scale = values.number("scale")
     if not scale > 0:

@@ -26,11 +26,7 @@ def read(source: Source, format: SourceFormat) -> Detections:
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
         members(entry, file, field, keypoints=list)
-        parts = {
-            key: file_numbers(entry[key], file, f"{field}.{key}", (None, 3), nulls=True)
-            for key in PARTS
-            if entry.get(key)
-        }
+        parts = {key: file_numbers(entry[key], file, f"{field}.{key}", (None, 3), nulls=True) for key in PARTS if entry.get(key)}
         if len(parts.get("keypoints", ())) == PARTS["keypoints"]:
             parts = {key: parts.get(key, np.zeros((count, 3))) for key, count in PARTS.items()}
             if wrong := [key for key, count in PARTS.items() if len(parts[key]) != count]:
@@ -39,9 +35,7 @@ def read(source: Source, format: SourceFormat) -> Detections:
         else:
             person = parts.get("keypoints", np.zeros((0, 3)))
         number = entry.get("personID", i)
-        people[
-            number if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people else len(people)
-        ] = person
+        people[number if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people else len(people)] = person
     first = next(iter(people.values()), np.zeros((0, 3)))
     found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
     name, size = content.get("filename"), (content.get("width"), content.get("height"))

@@ -52,9 +52,7 @@ class Keypoints:
             names = ", ".join(self.missing[:LISTED]) + (" ..." if len(self.missing) > LISTED else "")
             found.append(f"no keypoints of {len(self.missing)} views: {names}")
         if self.shifted:
-            found.append(
-                f"frames and photos are counted from different numbers and were matched in order: {self.shifted}"
-            )
+            found.append(f"frames and photos are counted from different numbers and were matched in order: {self.shifted}")
         if self.largest > 1:
             found.append(f"scores of up to {self.largest:.4g}, of another scale than [0, 1]: divided by that")
         if self.not_finite:

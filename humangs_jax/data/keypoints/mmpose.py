@@ -23,9 +23,7 @@ def recognizes(source: Source) -> bool:
     entries = _entries(source)
     if not isinstance(entries, list):
         return False
-    return not entries or any(
-        isinstance(each, dict) and each.keys() & {"keypoint_scores", "frame_id"} for each in entries
-    )
+    return not entries or any(isinstance(each, dict) and each.keys() & {"keypoint_scores", "frame_id"} for each in entries)
 
 
 def read(source: Source, format: SourceFormat) -> Detections:

@@ -91,9 +91,7 @@ def _amount(content: Any) -> int:
     return 1 + len(entries) + sum(len(each) for each in inside if isinstance(each, list))
 
 
-def read_keypoints(
-    path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None
-) -> Keypoints:
+def read_keypoints(path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None) -> Keypoints:
     """Keypoints of one person in the views of a capture.
 
     Arguments:
@@ -127,15 +125,9 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
     people, most, nobody = [], 0, Person(np.zeros((len(kind.names), columns)))
     for image, name in zip(images, names, strict=True):
         seen = () if image is None else image.people
-        found = [
-            _usable(each, largest, detections.offset, width, height, image, name) for each in seen if image is not None
-        ]
+        found = [_usable(each, largest, detections.offset, width, height, image, name) for each in seen if image is not None]
         most = max(most, len(found))
-        if (
-            image is not None
-            and person is None
-            and (clear := sum(_is_clear(each.values[body, 2]) for each in found)) > 1
-        ):
+        if image is not None and person is None and (clear := sum(_is_clear(each.values[body, 2]) for each in found)) > 1:
             choice = "Person I is the I-th of each view, counted from 0 in the order of the file"
             problem = f"{clear} people: expected one. {choice}; or crop the photos, or delete the others from the file"
             raise CaptureError(image.file, f"view {name}", problem)
@@ -165,9 +157,7 @@ def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> st
     """An image and its view whose numbers differ, because one is counted from 0 and the other from 1; "" if there is none."""
     for image, name in zip(images, names, strict=True):
         if image is not None:
-            numbers = [
-                re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each)) for each in (image.image, name)
-            ]
+            numbers = [re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each)) for each in (image.image, name)]
             if all(numbers) and int(numbers[0][-1]) != int(numbers[1][-1]):
                 return f"{image.image} is view {name}"
     return ""
@@ -271,9 +261,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
         if view is None:
             continue
         if view in owner:
-            raise ValueError(
-                f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view"
-            )
+            raise ValueError(f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view")
         owner[view] = image
     return views
 

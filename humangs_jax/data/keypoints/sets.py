@@ -94,9 +94,7 @@ def _mirrored_face(i: int) -> int:
 
 
 def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
-    return KeypointSet(
-        name, names, tuple(names.index(mirrored_name(each)) for each in names), places or plain_places(names)
-    )
+    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names), places or plain_places(names))
 
 
 COCO_17 = _keypoint_set("coco17", _COCO)
@@ -158,9 +156,7 @@ MEDIAPIPE_33 = _keypoint_set(
 )
 """MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
 
-KEYPOINT_SETS = {
-    each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_67, MEDIAPIPE_33)
-}
+KEYPOINT_SETS = {each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_67, MEDIAPIPE_33)}
 """The sets by name, as our npz files name them."""
 SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)}
 """The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""

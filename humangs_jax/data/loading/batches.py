@@ -105,9 +105,7 @@ class Loader:
         """
         return self._place([self.example_at(step, row) for row in self.rows])
 
-    def batches(
-        self, start: int, stop: int, waiting: Waiting | None = None
-    ) -> Generator[tuple[int, Example], None, None]:
+    def batches(self, start: int, stop: int, waiting: Waiting | None = None) -> Generator[tuple[int, Example], None, None]:
         """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
 
         Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.

@@ -237,9 +237,7 @@ class PeopleCache:
         if count == len({person.name for person in self.people}):
             raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
 
-    def _keep(
-        self, name: Path | str, view: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
-    ) -> None:
+    def _keep(self, name: Path | str, view: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> None:
         size = image.nbytes + mask.nbytes
         with self._lock:
             if (name, view) not in self._images and size <= self._free_bytes:
@@ -324,7 +322,5 @@ class CaptureSource:
                 continue
             shown, asked = range(len(inputs)), range(len(inputs), len(inputs) + len(targets))
             views = lambda indices, size: subject_views(seen, indices, size, self.depths)  # noqa: B023 (called at once)
-            return self.cache.name(subject_index), Example(
-                views(shown, self.input_size), views(asked, self.target_size)
-            )
+            return self.cache.name(subject_index), Example(views(shown, self.input_size), views(asked, self.target_size))
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")

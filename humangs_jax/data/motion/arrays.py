@@ -129,9 +129,7 @@ def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, fla
     if flat is not None and form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
         pose = flat.reshape(len(flat), 53, 3)
         return np.concatenate([pose[:, :22], pose[:, 52:], np.zeros_like(pose[:, :2]), pose[:, 22:52]], axis=1)
-    if (
-        flat is not None and form.pivot == "origin" and width in (69, 78, 87)
-    ):  # without the root; with coefficients of hands
+    if flat is not None and form.pivot == "origin" and width in (69, 78, 87):  # without the root; with coefficients of hands
         if width == 69:
             return np.pad(flat, ((0, 0), (3, 0))).reshape(len(flat), -1, 3)[:, :22]
         file.said.append(NO_HANDS.format(6))
@@ -148,9 +146,7 @@ def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, fla
     raise MotionError(file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}")
 
 
-def _hands(
-    file: "_MotionFile", place: str, key: str, values: np.ndarray, flat: np.ndarray | None, count: int
-) -> Rotations:
+def _hands(file: "_MotionFile", place: str, key: str, values: np.ndarray, flat: np.ndarray | None, count: int) -> Rotations:
     """Of one hand or both: fewer numbers are principal coefficients."""
     first, joints = PLACES[place]
     width, side = 0 if flat is None else flat.shape[1], int(place == "right_hand")
@@ -177,9 +173,7 @@ def _axis_angles(file: "_MotionFile", key: str, flat: Float[np.ndarray, "m colum
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
     if not _orthonormal(matrices):
-        raise MotionError(
-            file.path, key, f"expected rotation matrices, got others than rotations in shape {flat.shape}"
-        )
+        raise MotionError(file.path, key, f"expected rotation matrices, got others than rotations in shape {flat.shape}")
     return Rotation.from_matrix(matrices).as_rotvec().reshape(len(flat), joints, 3)
 
 
@@ -205,11 +199,7 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
             raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
         moves = moves / scale
     if form.pivot == "origin":
-        return (
-            moves
-            + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(PELVIS)
-            - PELVIS
-        )
+        return moves + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(PELVIS) - PELVIS
     if form.pivot == "head":
         joints = skeleton.shipped_joints()
         moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, HEAD]
@@ -224,9 +214,7 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
 def _cameras(file: "_MotionFile", count: int) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
     """Rotations and places of the cameras in the world for each frame, where files tell; None: they do not."""
     if "cam2world" in file.values:
-        matrices = file.numbers("cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)).reshape(
-            -1, 4, 4
-        )
+        matrices = file.numbers("cam2world", (count, 4, 4) if file.array("cam2world").ndim == 3 else (4, 4)).reshape(-1, 4, 4)
         turns, places = matrices[:, :3, :3], matrices[:, :3, 3]
     elif "pred_rotmat" in file.values:
         folders = (file.path, *file.path.parents[:2])
@@ -239,9 +227,7 @@ def _cameras(file: "_MotionFile", count: int) -> tuple[Float[np.ndarray, "m 3 3"
         kind = "world" if "world_cam_R" in camera else "pred"
         turns, places = camera.numbers(f"{kind}_cam_R", (None, 3, 3)), camera.numbers(f"{kind}_cam_T", (None, 3))
         if own.min() < 0 or own.max() >= min(len(turns), len(places)):
-            raise MotionError(
-                beside, f"{kind}_cam_R", f"expected one for each of {own.max() + 1} frames, got {len(turns)}"
-            )
+            raise MotionError(beside, f"{kind}_cam_R", f"expected one for each of {own.max() + 1} frames, got {len(turns)}")
         turns, places = turns[own], places[own]
     else:
         return None

@@ -81,11 +81,7 @@ def _humanoid(content: dict[str, Any]) -> dict[int, str]:
         bones = each.get("humanoid", {}).get("humanBones", {}) if isinstance(each, dict) else {}
         if isinstance(bones, list):  # of VRM 0
             bones = {str(bone.get("bone")): bone for bone in bones if isinstance(bone, dict)}
-        named = {
-            bone["node"]: name
-            for name, bone in bones.items()
-            if isinstance(bone, dict) and type(bone.get("node")) is int
-        }
+        named = {bone["node"]: name for name, bone in bones.items() if isinstance(bone, dict) and type(bone.get("node")) is int}
         if named:
             return named
     return {}
@@ -102,9 +98,7 @@ def _parents(nodes: Nodes) -> list[int]:
     return parents
 
 
-def _joints(
-    content: dict[str, Any], binary: bytes, nodes: Nodes
-) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
+def _joints(content: dict[str, Any], binary: bytes, nodes: Nodes) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far as the file tells."""
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -199,9 +193,7 @@ def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
     return [world[i][0] for i in range(len(nodes))]
 
 
-def _local(
-    node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, "m 4 4"]:
+def _local(node: dict[str, Any], tracks: Mapping[str, Track], times: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4 4"]:
     local = np.tile(np.eye(4), (len(times), 1, 1))
     if "matrix" in node:
         local[:] = np.asarray(node["matrix"], np.float64).reshape(4, 4).T

@@ -151,9 +151,7 @@ def load_motion(
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
     with reading(path, "motion", MotionError):
-        options = Reading(
-            hands, flat_hand_mean, None if fps is None else float(fps), person, None if clip is None else str(clip)
-        )
+        options = Reading(hands, flat_hand_mean, None if fps is None else float(fps), person, None if clip is None else str(clip))
         return _load(Path(path), up, options, rest_joints)
 
 

@@ -240,9 +240,7 @@ def _stacked(frames: Sequence[tuple[Any, list[Person]]]) -> list[Person]:
                     raise Refused(f"{file}: {min(missing)}: {problem}")
                 raise FileError(file, min(missing), problem)
         values = {key: [objects(values[key]) for _, _, values in seen] for key in keys}
-        values = {
-            k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()
-        }
+        values = {k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()}
         stacked.append(Person(name, values, np.asarray([i for i, _, _ in seen])))
     return stacked
 

@@ -44,9 +44,7 @@ def _finger(finger: str, i: int) -> tuple[str, ...]:
     """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the thumb."""
     number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
     words = (finger, "little") if finger == "pinky" else (finger,)
-    plain = [
-        form for w in words for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
-    ]
+    plain = [form for w in words for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")]
     bones = (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",)) if finger == "thumb" else _BONES
     plain += [w + bone for w in words for bone in bones[i - 1]]
     return (*plain, f"finger{number}{i - 1 or ''}")
@@ -120,9 +118,7 @@ TOPS = ("spine3", "neck", "left_shoulder")
 """Where the trunk ends: the first that the file has."""
 FEET = tuple(tuple(f"{side}_{name}" for side in SIDES) for name in ("ankle", "foot"))
 """Joints that may touch the floor, of both sides by kind."""
-EXPECTED_NAMES = (
-    "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of a person"
-)
+EXPECTED_NAMES = "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of a person"
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
@@ -257,9 +253,7 @@ def joint_places(
     for j, parent in enumerate(PARENTS):
         own = Rotation.from_rotvec(rotations[:, j]).as_matrix()
         world.append(own if parent < 0 else world[parent] @ own)
-        places.append(
-            translations + joints[0] if parent < 0 else places[parent] + world[parent] @ (joints[j] - joints[parent])
-        )
+        places.append(translations + joints[0] if parent < 0 else places[parent] + world[parent] @ (joints[j] - joints[parent]))
     return np.stack(places, axis=1)
 
 
@@ -291,7 +285,5 @@ def page_rules() -> dict[str, Any]:
     ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
-    formats = [
-        dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None and each.arrays.page
-    ]
+    formats = [dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None and each.arrays.page]
     return rules | {"PELVIS": PELVIS.tolist(), "COLUMNS": list(COLUMNS), "FORMATS": formats}

@@ -270,9 +270,7 @@ def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict
     return {name: height - min(found.values()) for name, height in found.items()}
 
 
-def _steps(
-    heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None
-) -> Float[np.ndarray, " m"]:
+def _steps(heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None) -> Float[np.ndarray, " m"]:
     """(m,) how high the feet are above the floor, which is where they are lowest.
 
     soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high as in its lowest frame.

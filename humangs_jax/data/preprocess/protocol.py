@@ -123,9 +123,7 @@ def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple
     return order[:train], order[train : train + test]
 
 
-def evaluation_indices(
-    counts: Mapping[str, int], inputs: int, targets: int = TARGETS
-) -> dict[str, dict[str, list[int]]]:
+def evaluation_indices(counts: Mapping[str, int], inputs: int, targets: int = TARGETS) -> dict[str, dict[str, list[int]]]:
     """{scene: {"context": [...], "target": [...]}} of scenes in file order with their numbers of views.
 
     Python's generator of seed 777: `inputs` views, then `targets` of the others. Raises: ValueError for a scene of too few.

@@ -192,9 +192,7 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
 Made = Iterator[tuple[str, Exception | None]]
 
 
-def _make_videos(
-    out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool
-) -> Made:
+def _make_videos(out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool) -> Made:
     """One after the other; photos are decoded by threads."""
     for name, folder in due.items():
         try:
@@ -208,9 +206,7 @@ def _make_videos(
             yield name, None
 
 
-def _make_scans(
-    out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool
-) -> Made:
+def _make_scans(out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool) -> Made:
     """Several processes, which have one thread each."""
     tasks = {name: (out / name, name, source, settings) for name, source in due.items()}
     load = functools.partial(FileBody.load, None if body.file == DEFAULT_BODY else body.file)
@@ -271,17 +267,13 @@ def _of_kind(mapping: Any, key: str, kind: type[T], file: Path, prefix: str = ""
 _KINDS: dict[type, str] = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
 
 
-def _write_lists(
-    out: Path, names: Sequence[str], scenes: dict[str, dict[str, Any]], settings: Settings
-) -> dict[str, Any]:
+def _write_lists(out: Path, names: Sequence[str], scenes: dict[str, dict[str, Any]], settings: Settings) -> dict[str, Any]:
     skipped = {
         file.stem: _of_kind(checked_json(file), "reason", str, file)
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }
-    train, test = (
-        split_ids(names, settings.train, settings.test) if DATASETS[settings.kind].scans else ([], sorted(names))
-    )
+    train, test = split_ids(names, settings.train, settings.test) if DATASETS[settings.kind].scans else ([], sorted(names))
     split = {"train": [name for name in train if name in scenes], "test": [name for name in test if name in scenes]}
     if settings.layout == "scenes":
         for part, chosen in split.items():
@@ -299,9 +291,7 @@ def _write_lists(
         "unreadable_photos": sum(len(each.get("unreadable", ())) for each in known.values()),
         "missing_photos": sum(sum(each.get("missing", {}).values()) for each in known.values()),
     }
-    return write_manifest(
-        out, DATA_SET, _made_with(settings), counts=counts, split=split, scenes=known, skipped=skipped
-    )
+    return write_manifest(out, DATA_SET, _made_with(settings), counts=counts, split=split, scenes=known, skipped=skipped)
 
 
 # One scene ------------------------------------------------------------------------------------------------------------
@@ -407,9 +397,7 @@ class Content:
 
 def _write(folder: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
     write = _write_scene if settings.layout == "scenes" else _write_capture
-    replace_folder(
-        folder, lambda temporary: write(temporary, folder, name, content, body, settings), mark=settings.mark
-    )
+    replace_folder(folder, lambda temporary: write(temporary, folder, name, content, body, settings), mark=settings.mark)
 
 
 def _write_images(folder: Path, view: View) -> tuple[str, ...]:
@@ -427,9 +415,7 @@ def _write_scene(folder: Path, target: Path, name: str, content: Content, body: 
     for posed in content.posed:
         arrays.append(f"smpl/{len(arrays):06d}.npz")
         transforms = content.transform @ posed.joint_transforms
-        write_arrays(
-            folder / arrays[-1], moved(content.transform, posed.vertices), posed.rest, content.faces, transforms
-        )
+        write_arrays(folder / arrays[-1], moved(content.transform, posed.vertices), posed.rest, content.faces, transforms)
     frames = []
     for view in content.views:
         image, mask = _write_images(folder, view)

@@ -105,15 +105,11 @@ def _in_camera_axes(
     return np.einsum("mcab,mckb->mcka", turns, world)
 
 
-def expected_noise(
-    points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
-) -> Float[np.ndarray, " m"]:
+def expected_noise(points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]) -> Float[np.ndarray, " m"]:
     """Pixels, from the size of the person in the views of a frame; 1 where nothing is seen."""
 
     def of_frame(points, seen):
-        sizes = [
-            np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max() for p, s in zip(points, seen, strict=True) if s.any()
-        ]
+        sizes = [np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max() for p, s in zip(points, seen, strict=True) if s.any()]
         return max(NOISE * float(np.median(sizes)), LEAST_NOISE) if sizes else 1.0
 
     return np.asarray([of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32)
@@ -161,9 +157,7 @@ def keypoint_residuals(
     """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
     errors = keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
     weights = observations.confidences * np.asarray(model.known, np.float32)
-    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)[..., None] * robust(
-        errors, scale
-    )
+    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)[..., None] * robust(errors, scale)
 
 
 def world_residuals(
@@ -177,10 +171,7 @@ def world_residuals(
     ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
     errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
     known = weights > 0
-    return (
-        jnp.where(known, jnp.sqrt(jnp.where(known, weights, 1.0)), 0.0)
-        * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
-    )
+    return jnp.where(known, jnp.sqrt(jnp.where(known, weights, 1.0)), 0.0) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
 
 
 @pytree_dataclass

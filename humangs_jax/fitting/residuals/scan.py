@@ -269,9 +269,7 @@ class Target:
         away = np.einsum("ra,ra->r", normals, points - vertices[rows])
         return away[weights > 0], float((weights > 0).mean())
 
-    def _posed(
-        self, problem: ScanProblem, state: FitState
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    def _posed(self, problem: ScanProblem, state: FitState) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Vertices (n, 3) in units of the frame and normals (n, 3)."""
         vertices, normals = pose_surface(problem.surface, *problem.body(state))
         return np.asarray(vertices, np.float64) / float(scale_of(state)), np.asarray(normals, np.float64)
@@ -281,7 +279,5 @@ def _tree(points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -
     return KDTree(np.concatenate([points, normals], axis=1))
 
 
-def _nearest(
-    tree: KDTree, points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]
-) -> Int[np.ndarray, " r"]:
+def _nearest(tree: KDTree, points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> Int[np.ndarray, " r"]:
     return tree.query(np.concatenate([points, normals], axis=1))[1]

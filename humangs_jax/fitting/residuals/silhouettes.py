@@ -286,9 +286,7 @@ def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int,
 
 
 @functools.partial(jax.jit, static_argnames="coefficients")
-def _between(
-    body: BodyModel, ends: Int[Array, "v p 2"], shares: Float[Array, "v p"], coefficients: int
-) -> SurfacePoints:
+def _between(body: BodyModel, ends: Int[Array, "v p 2"], shares: Float[Array, "v p"], coefficients: int) -> SurfacePoints:
     def one(ends, shares):
         def of(values):
             share = shares.reshape(-1, *(1,) * (values.ndim - 1))

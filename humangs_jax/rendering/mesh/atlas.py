@@ -56,9 +56,7 @@ class Atlas:
     texel: float
 
 
-def unwrap(
-    vertices: Points, faces: Faces, pieces: Int[np.ndarray, " f"], size: int, density: Float[np.ndarray, " f"]
-) -> Atlas:
+def unwrap(vertices: Points, faces: Faces, pieces: Int[np.ndarray, " f"], size: int, density: Float[np.ndarray, " f"]) -> Atlas:
     """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
 
     density: texels per metre of each face relative to others; the same all over a piece.
@@ -246,9 +244,7 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 def _pack(flat: _Flat, size: int) -> Atlas:
     """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
-    scale = size / np.sqrt(
-        np.prod(_sizes(flat), 0).sum()
-    )  # the boxes alone would fill the square: a start that is too large
+    scale = size / np.sqrt(np.prod(_sizes(flat), 0).sum())  # the boxes alone would fill the square: a start that is too large
     while (corners := _place(flat, scale, size)) is None:
         scale *= SHRINKING
     uvs = (flat.points * scale + corners[flat.point_charts]) / size

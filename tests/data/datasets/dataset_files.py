@@ -156,9 +156,7 @@ def calibration(names):
     poses, K = cameras()
     flat = lambda x: np.asarray(x, float).reshape(-1).tolist()
     size = [WIDTH, HEIGHT]
-    return {
-        n: {"K": flat(K), "R": flat(R), "T": flat(T), "imgSize": size} for n, (R, T) in zip(names, poses, strict=True)
-    }
+    return {n: {"K": flat(K), "R": flat(R), "T": flat(T), "imgSize": size} for n, (R, T) in zip(names, poses, strict=True)}
 
 
 def write_avatarrex(folder, frames=FRAMES):

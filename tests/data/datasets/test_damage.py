@@ -149,9 +149,7 @@ for layout, file, camera in (
     this = functools.partial(case, layout)
     every(layout, file, "", whole=True)
     this("calibration missing", removed(file))
-    set_to = lambda key, change, camera=camera, file=file: jsn(
-        file, lambda c: c[camera].update({key: change(c[camera][key])})
-    )
+    set_to = lambda key, change, camera=camera, file=file: jsn(file, lambda c: c[camera].update({key: change(c[camera][key])}))
     for key in ("K", "R", "T"):
         this(f"no {key}", jsn(file, lambda c, key=key, camera=camera: c[camera].pop(key)), file, camera, key, "missing")
     this("no image size", jsn(file, lambda c, camera=camera: c[camera].pop("imgSize")), file, camera, "imgSize")
@@ -401,9 +399,7 @@ def honest(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("layout", "damage", "words"), CASES)
-def test_damage_is_one_line_that_names_file_and_key(
-    layout, damage, words, honest, body, tmp_path, monkeypatch, request
-):
+def test_damage_is_one_line_that_names_file_and_key(layout, damage, words, honest, body, tmp_path, monkeypatch, request):
     folder = tmp_path / "set"
     shutil.copytree(honest(layout), folder)
     damage(folder)

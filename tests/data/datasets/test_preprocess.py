@@ -192,9 +192,7 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
         np.testing.assert_allclose(distance, 2 * known["radius"], rtol=1e-4)
         image, mask = subject.photo(0, SIZE)
         assert 0.05 < (mask > 0).mean() < 0.6 and (image[mask == 0] == 255).all()
-    captures = Preprocess(
-        "thuman", source, views, tmp_path / "captures", Path(body.file), size=SIZE, workers=1, layout="capture"
-    )
+    captures = Preprocess("thuman", source, views, tmp_path / "captures", Path(body.file), size=SIZE, workers=1, layout="capture")
     captures.run()
     capture = load_capture(tmp_path / "captures" / people[0].name.rsplit(" ", 1)[1])
     wanted = people[0].subject
@@ -203,9 +201,7 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
     matrices = lambda rotations: Rotation.from_rotvec(np.asarray(rotations, float).reshape(-1, 3)).as_matrix()
     found = matrices(capture.poses.rotations)
     np.testing.assert_allclose(found, matrices(wanted.parameters([0]).rotations), atol=1e-4)
-    np.testing.assert_allclose(
-        np.asarray(capture.poses.translation), wanted.parameters([0]).translations, atol=MILLIMETRE
-    )
+    np.testing.assert_allclose(np.asarray(capture.poses.translation), wanted.parameters([0]).translations, atol=MILLIMETRE)
 
 
 def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, body):

@@ -114,9 +114,7 @@ def test_another_body_or_another_kind_of_fit_is_noticed_by_its_mesh(tmp_path):
     thuman = open_thuman(write_thuman(tmp_path / "thuman", arrays))
     (tmp_path / "other").mkdir()
     other = write_model(tmp_path / "other", seed=1)
-    with pytest.raises(
-        ValueError, match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male"
-    ):
+    with pytest.raises(ValueError, match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male"):
         scan_content("0000", thuman, other, Settings("thuman"))
     with pytest.raises(ValueError, match=r"kind C.*neutral"):
         scan_content("0002", thuman, other, Settings("thuman"))

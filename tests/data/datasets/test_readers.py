@@ -217,9 +217,7 @@ def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
     batch = loader.batch_at(0)
     assert batch.inputs.images.shape == (4, 2, SIZE // 2, SIZE // 2, 3)
     assert batch.targets.images.shape == (4, 2, SIZE, SIZE, 3) and batch.inputs.rotations.shape == (4, 2, 55, 3)
-    again = Loader(CaptureSource(PeopleCache(people), source.sampling, SIZE // 2, SIZE), batch_size=4, seed=1).batch_at(
-        0
-    )
+    again = Loader(CaptureSource(PeopleCache(people), source.sampling, SIZE // 2, SIZE), batch_size=4, seed=1).batch_at(0)
     np.testing.assert_array_equal(batch.targets.images, again.targets.images)
     for step in range(1, 8):
         loader.batch_at(step)
