@@ -96,7 +96,7 @@ def measure(root: Path) -> dict[str, Any]:
 
 def written(text: str) -> str:
     """A page without what scripts write into it, and without code."""
-    text = re.sub(r"<!-- table: .*?<!-- end -->", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
     return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
