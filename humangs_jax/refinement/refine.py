@@ -82,7 +82,28 @@ def refine(
 ) -> Avatar:
     """The avatar, fitted to the photos of a capture, or the avatar itself where that makes it no better.
 
-    Arguments and errors as of `refine_with_report`.
+    Learned-optimizer iterations, then Adam for as long as asked, or steps on the head alone where photos have 512 px or more.
+    Views whose mask does not show the person are left out, and exposure is made equal as in `reconstruct`. Ctrl-C ends the run;
+    the best state until then is returned. `refine_with_report` also tells the steps, the seconds and the gain.
+
+    Args:
+        avatar: of the person in the photos, on the body of the capture.
+        capture: photos with masks, in any poses.
+        config: how; None: `RefineConfig()`.
+        seconds: limit, instead of the configuration's; it becomes a number of steps before the first one.
+        steps: the same in steps, which repeats a run exactly on the same machine; 0: iterations, and the head, alone.
+        progress: show a bar.
+        watch: gets the avatar so far after the iterations and at each of the checks; its time counts.
+
+    Returns:
+        The refined avatar.
+
+    Raises:
+        ValueError: if the capture has no view or no masks or no view that shows the person, or its poses have another
+            number of joints than the avatar.
+
+    Examples:
+        >>> sharp = hg.refine(avatar, capture, seconds=15)
     """
     return refine_with_report(avatar, capture, config, seconds=seconds, steps=steps, progress=progress, watch=watch).avatar
 

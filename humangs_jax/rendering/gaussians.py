@@ -152,7 +152,14 @@ class UnconstrainedGaussians(Batchable):
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
     """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
 
-    A low-pass is no parameter: it stays in the scales. Raises: ValueError for Gaussians with deformations.
+    Args:
+        gaussians: without deformations. A low-pass is no parameter: it stays in the scales.
+
+    Returns:
+        Parameters without bounds: log scales, logits.
+
+    Raises:
+        ValueError: for Gaussians with deformations.
 
     Examples:
         >>> parameters = hg.unconstrain(gaussians)
@@ -173,7 +180,17 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
 
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
-    """The Gaussians that parameters stand for: scales are positive, opacities and colors in (0, 1)."""
+    """The Gaussians that parameters stand for: scales are positive, opacities and colors in (0, 1).
+
+    Args:
+        parameters: without bounds, as an optimizer of optax moves them.
+
+    Returns:
+        Gaussians.
+
+    Examples:
+        >>> gaussians = hg.constrain(parameters)
+    """
     return Gaussians(
         parameters.means,
         parameters.quats,

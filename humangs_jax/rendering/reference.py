@@ -33,9 +33,22 @@ def render_reference(
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
-    """The image of `splatting.render` by its definition, without tiles or buffers, in the precision of its arguments.
+    """The image of `render` by its definition, without tiles or buffers, in the precision of its arguments.
 
-    Arguments as `splatting.render`; of `config`, only what decides on what is drawn is read. Values are not checked.
+    Of `config`, only what decides on what is drawn is read. Values are not checked.
+
+    Args:
+        gaussians: as `render`; float64 arrays give float64 images.
+        camera: as `render`.
+        config: as `render`.
+        background: as `render`.
+
+    Returns:
+        A `Rendering`.
+
+    Examples:
+        >>> with jax.enable_x64():
+        ...     exact = hg.render_reference(gaussians, camera).rgb
     """
     drawn = with_background(gaussians, camera, background)
     return _reference(*drawn, splat_config(config), features_of(gaussians, features))

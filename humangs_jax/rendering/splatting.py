@@ -98,25 +98,35 @@ def render(
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
-    """Draws Gaussians as one camera sees them.
+    """Draw Gaussians as one camera sees them. After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
-        rendering = render(gaussians, camera)             # eager: inputs are checked, buffers sized to the scene
-        config = SplatConfig(warn_overflow=True)          # for calls inside jit, vmap and grad: buffers are sized once,
-        config = plan_buffers(gaussians, cameras, config) # and a warning is logged should they ever be too small
-        loss = lambda gaussians: jnp.mean((render(gaussians, camera, config).rgb - photo) ** 2)
-        gradient = jax.jit(jax.grad(loss), compiler_options=compiler_options())(gaussians)
+    Called directly, arguments are checked and buffers sized to the scene. Inside `jit`, `vmap` and `grad` values are not
+    checked, and buffers come from `config`: `plan_buffers` sizes them once. Pairs of splats and tiles that do not fit are not
+    drawn there; they are counted in `Rendering.overflow`, which `SplatConfig.warn_overflow` logs. Conventions are gsplat's
+    (`rendering.splat_config`).
 
-    Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
-    the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a color's name; None: white.
-    features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has learned.
+    Args:
+        gaussians: one set of g, metres.
+        camera: one camera; its size is the image's.
+        config: what is drawn, and the buffers; or the name of one of `SPLAT_PRESETS`.
+        background: (3,) RGB, three numbers, or a color's name. None: white.
+        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels, what a network has
+            learned.
 
-    Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
-    each other, a background that is no color, values that are not finite, opacities outside of [0, 1] and negative scales or
-    focal lengths; BufferOverflowError if `config.max_pairs` or `max_rows` is too small. Inside a transformation values are not
-    checked. Pairs that do not fit are not drawn there, and are counted in `Rendering.overflow`; `SplatConfig.warn_overflow` logs
-    them. Loops that draw often jit `render`, which saves both checks.
+    Returns:
+        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility.
 
-    After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079), with gsplat's conventions (see `splat_config`).
+    Raises:
+        TypeError: for arguments of other classes.
+        ValueError: for a batch of cameras or of sets, shapes that do not fit each other, a background that is no color,
+            values that are not finite, opacities outside of [0, 1], and negative scales or focal lengths.
+        BufferOverflowError: if `config.max_pairs` or `max_rows` is too small.
+
+    Examples:
+        >>> rendering = hg.render(gaussians, camera)
+        >>> config = hg.plan_buffers(gaussians, cameras)
+        >>> loss = lambda gaussians: jnp.mean((hg.render(gaussians, camera, config).rgb - photo) ** 2)
+        >>> gradient = jax.jit(jax.grad(loss), compiler_options=hg.compiler_options())(gaussians)
     """
     if camera.batch_shape:
         raise ValueError(
@@ -133,13 +143,25 @@ def render_views(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
 ) -> Rendering:
-    """Draws every camera of a batch (leading axis v), one after the other: working memory does not grow with v
-    (what a gradient keeps of each view does).
+    """Draw every camera of a batch (leading axis v), one after the other: working memory does not grow with v.
 
-    `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles) and holds the buffers of all. On
-    CPUs it is as fast, but slower with gradients of many views. Arguments and errors: as `render`.
+    What a gradient keeps of each view does. `jax.vmap` of `render` draws all views at once and holds the buffers of all. On
+    CPUs it is as fast, but slower with gradients of many views.
 
-    Returns a Rendering with a leading axis v. Raises: also ValueError for a single camera or several batch axes.
+    Args:
+        gaussians: as `render`.
+        cameras: a batch of v.
+        config: as `render`.
+        background: as `render`.
+
+    Returns:
+        A `Rendering` with a leading axis v.
+
+    Raises:
+        ValueError: as `render`; also for a single camera or several batch axes.
+
+    Examples:
+        >>> images = hg.render_views(gaussians, cameras).rgb  # (v, h, w, 3)
     """
     if len(cameras.batch_shape) != 1:
         raise ValueError(
@@ -440,13 +462,25 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """`config` with buffers for one camera, or for the most demanding one of a batch, times `margin`.
+    """A configuration with buffers for one camera, or for the most demanding one of a batch, times `margin`.
 
-    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
-    call it outside of transformations.
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays: call it
+    outside of transformations.
 
     No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
     `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
+
+    Args:
+        gaussians: one set.
+        cameras: one, or a batch.
+        config: what the buffers are added to.
+        margin: how many times as many pairs as there are fit.
+
+    Returns:
+        `config` with `max_pairs` and `max_rows`.
+
+    Examples:
+        >>> config = hg.plan_buffers(gaussians, cameras, margin=2.0)
     """
     config = splat_config(config)
     rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config))

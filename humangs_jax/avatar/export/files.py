@@ -41,16 +41,27 @@ def export(
     rest_fields: bool = False,
     name: str = "motion",
 ) -> list[Path]:
-    """Write an avatar in T-pose, in one pose, or in the poses of a motion; returns the files. Each appears whole or not at all.
+    """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears whole or not at all.
 
-    Arguments:
-        path: with a suffix of `EXPORTS`. mesh: as a mesh where the suffix has formats of Gaussians, too.
+    Args:
+        path: with a suffix of `EXPORTS`.
+        avatar: one person.
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
-        numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who jumps leaves it. None: the
-            motion has one frame, whose feet are on 0.
-        up: the axis that points up; None for the format's own. rest_fields: see `write_ply`. name: of the animation.
+        numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who jumps leaves it. None:
+            the motion has one frame, whose feet are on 0.
+        mesh: as a mesh where the suffix has formats of Gaussians, too.
+        up: the axis that points up; None for the format's own.
+        rest_fields: see `write_ply`.
+        name: of the animation.
 
-    Raises: ValueError for another suffix, a format without what is asked for, or if `numbers` are not one for each frame.
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: for another suffix, a format without what is asked for, or if `numbers` are not one for each frame.
+
+    Examples:
+        >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)
     """
     form = chosen_format(path.suffix, mesh)
     if form is None:

@@ -150,9 +150,9 @@ def load_gaussians(path: str | os.PathLike) -> Gaussians:
         FileNotFoundError: There is no such file.
         FileError: It cannot be read, is larger than the limits allow, or has other numbers than it should: file and property.
 
-    Example:
-        scene = hg.load_gaussians("garden.ply")
-        image = hg.render(scene, camera, hg.SPLAT_PRESETS["inria"])
+    Examples:
+        >>> scene = hg.load_gaussians("garden.ply")
+        >>> image = hg.render(scene, camera, hg.SPLAT_PRESETS["inria"])
     """
     with reading(path, "file of Gaussians"):
         data = read_bytes(path, "array_bytes")
@@ -178,8 +178,8 @@ def save_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
     Raises:
         ValueError: Another suffix, numbers that files cannot hold, or harmonics that the format does not.
 
-    Example:
-        hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply"))
+    Examples:
+        >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply"))
     """
     form = chosen_format(os.path.splitext(path)[1])
     if form is None or form.mesh:

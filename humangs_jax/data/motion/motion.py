@@ -124,22 +124,28 @@ def load_motion(
 ) -> Motion:
     """Read a motion; suffix and content decide the format (docs/motions.md).
 
-    Arguments:
-        path: None for the walk that comes with the package; else a file or a folder of one of `data.formats.MOTIONS`.
-        up: axis of the file's world that points up ("y", "-y", "z", ...); the motion is turned so that y does. "auto" is
-            the format's own: AMASS z, others y; of .bvh the up of the rest pose if a person stands in it, else y. It is
-            another only where people stand along that and its floor carries them (`rules.up_axis`), which is logged as a
-            warning, and never in our own format, AIST++ and .glb.
+    Args:
+        path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
+        up: axis of the file's world that points up ("y", "-y", "z" and so on); the motion is turned so that y does. "auto":
+            the format's own, or another one along which people stand on a floor, which is logged as a warning
+            (`rules.up_axis`).
         fps: frames per second in place of those in the file.
-        person: the number of the person, in a file of several people. clip: of the animations of a GLB file, its name or number
-            from 0; None: the first.
-        hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
-            `flat_hand_mean` False, which adds the mean hand (only to hands that a file has). Our own format holds
-            whole rotations: there is nothing to add.
-        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other programs
-            are brought to it, and a motion of another number of joints is refused. None: the shipped body.
+        hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers and for `flat_hand_mean` False.
+        flat_hand_mean: False adds the mean hand to hands that a file has. Our own format holds whole rotations: there is
+            nothing to add.
+        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other
+            programs are brought to it, and a motion of another number of joints is refused. None: the shipped body.
+        person: the number of the person, in a file of several.
+        clip: of the animations of a GLB file, its name or number. None: the first.
 
-    Raises: MotionError, one line naming file and key.
+    Returns:
+        Rotations, translations and frames per second.
+
+    Raises:
+        MotionError: one line naming file and key.
+
+    Examples:
+        >>> motion = hg.load_motion("dance.bvh", rest_joints=avatar.rest_joints)
     """
     if up not in ("auto", *rules.UPRIGHT):
         raise ValueError(f"up: expected auto, {', '.join(rules.UPRIGHT)}, got {up!r}")
