@@ -150,7 +150,7 @@ def test_a_person_can_be_chosen(tmp_path):
 
 FAULTS = {
     "no JSON": ("{,", r"line 1: not valid JSON"),
-    "no keypoints": ({"cameras": []}, r"no keypoints: expected those of humangs detect; OpenPose; COCO, "),
+    "no keypoints": ({"cameras": []}, r"no keypoints: expected those of humangs detect; OpenPose; "),
     "a number": (3, r"no keypoints: expected"),
     "a list of numbers": ([1, 2], r"no keypoints: expected"),
     "empty list": ([], r"nobody in any of its images"),
@@ -158,7 +158,7 @@ FAULTS = {
     "nobody": ({"version": 1.3, "people": []}, r"nobody in any of its images"),
     "another": (
         [entry(count=27)],
-        r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) points, got 27",
+        r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) or 136 \(halpe136\) points, got 27",
     ),
     "two sets": ([entry(), entry("back", count=133)], r"image back: a person of 133 points, but another has 17"),
     "no triples": ([{"image_id": "front", "keypoints": [1.0] * 50}], r"\[0\]\.keypoints: expected a flat list of"),
@@ -244,7 +244,7 @@ OWN = {
         ({"names": np.array([{}, {}])}, r"names: a pickled object"),
         (
             {"set": np.array("halpe27")},
-            r"set: expected one of coco17, halpe26, wholebody133, openpose67, mediapipe33, got 'halpe27'",
+            r"set: expected one of coco17, halpe26, wholebody133, halpe136, openpose67, mediapipe33, got 'halpe27'",
         ),
         ({"points": np.ones((2, 133, 2))}, r"points: expected shape \(2, 17, 2\), got \(2, 133, 2\)"),
         ({"confidences": np.ones((1, 17))}, r"confidences: expected shape \(2, 17\)"),
