@@ -60,9 +60,9 @@ class Formats(dict[str, F]):
 
     def listed(self) -> str:
         """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by name where names do not tell."""
-        groups: dict[tuple[str, ...], list[str]] = {}
+        groups: dict[tuple[str, ...], dict[str, None]] = {}  # each name once
         for name, each in self.items():
-            groups.setdefault(each.suffixes or (name,), []).append(each.about)
+            groups.setdefault(each.suffixes or (name,), {}).update(dict.fromkeys(each.about.split(", ")))
         return "; ".join(f"{alternatives(key)}: {', '.join(abouts)}" for key, abouts in groups.items())
 
 
