@@ -119,6 +119,8 @@ class Reconstruct:
     def run(self) -> None:
         limits = first_refinement(self.refine)
         part, parts = shard_of(self.shard)
+        if not self.captures:
+            raise UsageError("CAPTURES: expected at least one folder with capture.json")
         captures = _capture_folders(self.captures)
         several = tuple(captures.values()) != self.captures[:1]
         out = self.out or Path("avatars" if several else "avatar.npz")

@@ -42,7 +42,7 @@ class Evaluate:
     avatar: Path | None = None
     """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
     weights: Path | None = None
-    """Network weights (.safetensors)."""
+    """Network weights (.safetensors). Default, without --avatar and --predictions: the shipped ones."""
     predictions: Path | None = None
     """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
     protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = "humangs"

@@ -169,7 +169,7 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
     """
     if gaussians.deformations is not None:
         raise ValueError("unconstrain: the Gaussians carry deformations: take rendering.gaussians.factored(gaussians)")
-    return UnconstrainedGaussians(
+    parameters = UnconstrainedGaussians(
         gaussians.means,
         gaussians.quats,
         jnp.log(jnp.maximum(gaussians.scales, SMALLEST_SCALE)),
@@ -177,6 +177,8 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
         inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
         gaussians.harmonics,
     )
+    # of `jnp.full(n, 0.5)` types are weak, those of a step's result are not: the step would compile twice
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
 
 
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:

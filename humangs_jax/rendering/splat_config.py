@@ -46,7 +46,7 @@ MEASURED = "performance.md"
 @jax.tree_util.register_static
 @configuration
 class SplatConfig:
-    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule. docs/performance.md gives what
+    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule. docs/knobs.md gives what
     each knob costs and gains.
     """
 

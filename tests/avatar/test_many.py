@@ -100,6 +100,7 @@ def test_shards_are_all_captures_once(people, humangs):
     [
         ("reconstruct people --out x.npz", "--out x.npz: expected a folder"),
         ("reconstruct people/a people/b/../a", "people/b/../a and people/a: expected captures of different names"),
+        ("reconstruct", "CAPTURES: expected at least one folder"),
         ("reconstruct people --shard 3/3", "--shard 3/3: expected I/N"),
         ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
     ],

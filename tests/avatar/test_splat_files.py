@@ -61,6 +61,16 @@ def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
     assert_close(hg.load_gaussians(str(path.rename(tmp_path / ("c.splat" if suffix == ".splat" else "c.bin")))), back, [0] * 5)
 
 
+@pytest.mark.parametrize("suffix", STEPS)
+def test_worlds_with_y_up_come_back_and_stand_upright_everywhere(suffix, tmp_path):
+    """The head of a person who is exported is above the feet for viewers of every format."""
+    hg.save_gaussians(tmp_path / f"a{suffix}", before := scene(), y_up=True)
+    assert_close(hg.load_gaussians(tmp_path / f"a{suffix}", y_up=True), before, STEPS[suffix])
+    plain = np.asarray(hg.load_gaussians(tmp_path / f"a{suffix}").means)
+    sign = -1 if suffix in (".ply", ".splat") else 1  # y of what viewers read
+    np.testing.assert_allclose(plain[:, 1], sign * np.asarray(before.means)[:, 1], atol=STEPS[suffix][0])
+
+
 def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
     rng = np.random.default_rng(3)
     bent = replace(scene(), deformations=jnp.asarray(np.eye(3) + 0.2 * rng.normal(size=(20, 3, 3)), jnp.float32))

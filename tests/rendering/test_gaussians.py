@@ -96,6 +96,13 @@ def test_bounds_are_met_within_the_margins():
     assert (after.scales > 0).all()
 
 
+def test_parameters_of_constants_have_types_of_their_own():
+    """Weakly typed ones would compile a step of an optimizer twice."""
+    n = 4
+    flat = Gaussians(jnp.zeros((n, 3)), jnp.ones((n, 4)), jnp.full((n, 3), 0.03), jnp.full(n, 0.7), jnp.full((n, 3), 0.5))
+    assert jax.tree.leaves(flat)[3].weak_type and not any(leaf.weak_type for leaf in jax.tree.leaves(hg.unconstrain(flat)))
+
+
 def test_optax_never_leaves_the_domain():
     optimizer, parameters = optax.adam(1.0), hg.unconstrain(within_bounds())
     state = optimizer.init(parameters)

@@ -3,7 +3,7 @@
 Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colors in [0, 1]. glTF's world is
 the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z.
 `.spz` has axes to the right, up and back, half a turn about y from ours. So converters make the same of all of them.
-`export` turns avatars so; `load_gaussians` and `save_gaussians` leave the numbers as they are.
+`export` turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
 """
 
 import os
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.export import EXPORTS, Up, chosen_format
+from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
@@ -134,13 +134,13 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 
 @checked_arguments
-def load_gaussians(path: str | os.PathLike) -> Gaussians:
+def load_gaussians(path: str | os.PathLike, *, y_up: bool = False) -> Gaussians:
     """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`.
-
-    The numbers are those of the file: nothing is turned, moved or scaled. So y points down in most `.ply` and `.splat`.
 
     Args:
         path: The file. How it begins decides the format; where that does not tell (`.splat`), its suffix.
+        y_up: Turn them from the world that viewers of the format expect (y down in `.ply` and `.splat`) to one with y up, as
+            `orbit` has it. False: the numbers stay those of the file, and its cameras fit.
 
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1], colors 1/2 + Y00 f_dc, and
@@ -151,8 +151,8 @@ def load_gaussians(path: str | os.PathLike) -> Gaussians:
         FileError: It cannot be read, is larger than the limits allow, or has other numbers than it should: file and property.
 
     Examples:
-        >>> scene = hg.load_gaussians("garden.ply")
-        >>> image = hg.render(scene, camera, hg.SPLAT_PRESETS["inria"])
+        >>> scene = hg.load_gaussians("garden.ply", y_up=True)
+        >>> image = hg.render(scene, camera, "inria")
     """
     with reading(path, "file of Gaussians"):
         data = read_bytes(path, "array_bytes")
@@ -160,31 +160,39 @@ def load_gaussians(path: str | os.PathLike) -> Gaussians:
         form = next(begun, None) or chosen_format(os.path.splitext(path)[1])
         if form is None or not form.reader:
             raise Refused(f"not known: expected a file ending in {_suffixes()}")
-        return imported(form.reader)(data)
+        gaussians = imported(form.reader)(data)
+        return _between_worlds(gaussians, form) if y_up else gaussians
 
 
 @checked_arguments
-def save_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
+def save_gaussians(path: str | os.PathLike, gaussians: Gaussians, *, y_up: bool = False) -> None:
     """Write Gaussians into a file for other programs; it appears whole or not at all.
 
-    The numbers stay as they are: nothing is turned or moved, so what is up depends on who reads it; `export` turns avatars as
-    each program expects. Deformations become quaternions and scales. A low-pass is taken out of the scales.
+    Deformations become quaternions and scales. A low-pass is taken out of the scales.
 
     Args:
         path: Ends in `.ply` (3DGS), `.splat` (8-bit colors, the largest Gaussians first), `.spz` (8-bit colors, scales in steps
             of 6 %, harmonics from -1 to 1) or `.glb` (KHR_gaussian_splatting).
-        gaussians: With or without harmonics, which `.splat` does not hold.
+        gaussians: With or without harmonics, which `.splat` does not hold (`hg.replace(gaussians, harmonics=None)`).
+        y_up: They have y up, and are turned to the world that viewers of the format expect: y down in `.ply` and `.splat`, up in
+            `.spz` and `.glb`. False: the numbers stay as they are.
 
     Raises:
         ValueError: Another suffix, numbers that files cannot hold, or harmonics that the format does not.
 
     Examples:
-        >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply"))
+        >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
     """
     form = chosen_format(os.path.splitext(path)[1])
     if form is None or form.mesh:
         raise ValueError(f"{path}: expected a name ending in {_suffixes()}")
-    form(path, gaussians)
+    form(path, _between_worlds(gaussians, form) if y_up else gaussians)
+
+
+def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
+    """From a world with y up to the one that viewers of a format expect, or back: half turns are their own inverse."""
+    turned = rotated(gaussians, up_turn(form.up))
+    return rotated(turned, BACKWARDS) if form.backwards else turned
 
 
 def _suffixes() -> str:

@@ -22,7 +22,9 @@ def write_splat(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if harmonics.size:
-        raise ValueError(f"{path}: .splat holds one color for each Gaussian: expected no harmonics")
+        raise ValueError(
+            f"{path}: .splat holds one color for each Gaussian: expected no harmonics (replace(gaussians, harmonics=None))"
+        )
     rows = np.empty(len(means), ROW)
     rows["position"], rows["scale"] = means, scales
     rows["rgba"] = np.rint(255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1))
