@@ -140,7 +140,7 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         arrays, _ = read_npz(path)
         header = parse_json(str(arrays["header"]))
     except (FileError, KeyError) as error:
-        raise FileError(path, "", f"not an avatar of `humangs reconstruct` (missing: {error})") from error
+        raise FileError(path, "", f"not an avatar file written by humangs ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != VERSION:
         found = header if isinstance(header, dict) else {}
         raise Refused(f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}")
