@@ -58,6 +58,8 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 
 TICK = 0.2
 """Seconds between two updates of the line."""
+LONG = 10.0
+"""Seconds after which a stage is named where stderr is no terminal."""
 CLEAR = "\r\033[K"
 """Puts the cursor of a terminal at the beginning of an empty line."""
 
@@ -66,12 +68,14 @@ CLEAR = "\r\033[K"
 class Progress:
     """What is shown, and what was measured.
 
-    ticking: a line on stderr counts the seconds of a stage while it runs. lines: each stage leaves a line there. quiet: neither
-    stages nor bars are shown. seconds: of the finished outermost stages by name, since `started`. names: of the stages that
-    run; paused: a bar has the line. next: what the user may do next, for whoever began.
+    ticking: a line on stderr counts the seconds of a stage while it runs. naming: without a terminal, a `LONG` stage leaves its
+    name there. lines: each stage leaves a line with its seconds. quiet: neither stages nor bars are shown. seconds: of the
+    finished outermost stages by name, since `started`. names: of the stages that run; paused: a bar has the line. next: what the
+    user may do next, for whoever began.
     """
 
     ticking: bool = False
+    naming: bool = False
     lines: bool = False
     quiet: bool = False
     started: float = dataclasses.field(default_factory=time.perf_counter)
@@ -92,7 +96,8 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
     Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever stderr goes.
     """
     global _current
-    _current = Progress(ticking=sys.stderr.isatty() and not quiet, lines=lines and not quiet, quiet=quiet)
+    terminal, shown = sys.stderr.isatty(), not quiet
+    _current = Progress(ticking=terminal and shown, naming=shown and not terminal, lines=lines and shown, quiet=quiet)
     return _current
 
 
@@ -133,8 +138,8 @@ def stage(name: str) -> Generator[None]:
     current.paused = False
     started, stop = time.perf_counter(), threading.Event()
     outermost = len(current.names) == 1
-    ticker = threading.Thread(target=_tick, args=(current, stop, started), daemon=True)
-    if outermost and current.ticking:
+    ticker = threading.Thread(target=_tick if current.ticking else _name, args=(current, stop, started), daemon=True)
+    if outermost and (current.ticking or current.naming):
         ticker.start()
     try:
         yield
@@ -180,6 +185,11 @@ def _close(bars: set[Any]) -> None:
 def watched() -> bool:
     """Whether a program shows stages on a terminal: then long loops without a bar of their own show one."""
     return _current.ticking
+
+
+def _name(current: Progress, stop: threading.Event, _: float) -> None:
+    if not stop.wait(LONG) and current.names:
+        say(f"{current.names[0]} ...", error=True)
 
 
 def _tick(current: Progress, stop: threading.Event, started: float) -> None:

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -118,3 +119,15 @@ def test_tables_are_aligned_and_rows_may_end_early():
         "b                 -",
     ]
     assert progress.text_table([["a", "b"], ["cc", "d"]], left=2) == ["a   b", "cc  d"]
+
+
+def test_long_stages_are_named_where_there_is_no_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "LONG", 0.05)
+    for quiet in (False, True):
+        progress.begin(quiet=quiet)
+        with progress.stage("short"):
+            pass
+        with progress.stage("fitting"):
+            time.sleep(0.3)
+        progress.end()
+        assert capsys.readouterr().err == ("" if quiet else "fitting ...\n")
