@@ -14,7 +14,7 @@ from typing import ClassVar
 import pytest
 
 from humangs_jax import __version__, cli
-from humangs_jax.cli import fit, screen
+from humangs_jax.cli import fit, options, screen
 from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
 from humangs_jax.core.configuration import ArgumentError
@@ -160,6 +160,24 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
 
 
 # What a command shows -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("reconstruct me --refin 15s", "--refin: no option of humangs reconstruct: did you mean --refine?"),
+        ("start photos --out me --fit-masks", "--fit-masks: no option of humangs start: did you mean --no-fit-masks?"),
+        ("synth --zzz", "--zzz: no option of humangs synth"),
+    ],
+)
+def test_a_wrong_option_is_one_line_with_the_nearest(words, said, humangs):
+    assert humangs(*words.split()) == (cli.BAD_USAGE, "", f"humangs: error: {said}\n")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_a_help_text_is_known(command, humangs):
+    shown = set(re.findall(r"^.? (--[a-z][\w-]*)", humangs(command, "--help")[1], re.MULTILINE))  # with boxes or without
+    assert shown == options.option_names(cli._command(command))
 
 
 def test_version_and_unknown_commands(humangs):

@@ -144,7 +144,7 @@ def _parsed(arguments: list[str]) -> Command:
         raise SystemExit(0 if arguments else BAD_USAGE)
     import tyro
 
-    from humangs_jax.cli.options import UsageError, described
+    from humangs_jax.cli.options import UsageError, described, option_names
 
     name, *options = arguments
     if name == "--tyro-print-completion" or name == "--tyro-write-completion":
@@ -155,6 +155,12 @@ def _parsed(arguments: list[str]) -> Command:
         hint = f"did you mean {near[0]!r}?" if near else "`humangs --help` lists them"
         raise UsageError(f"{name!r} is no command: {hint}")
     command = described(_command(name))
+    known = option_names(command) | {"--help"}
+    for word in options:
+        option = word.split("=")[0].replace("_", "-")
+        if option.startswith("--") and option not in known:
+            near = difflib.get_close_matches(option, known, n=1)
+            raise UsageError(f"{option}: no option of humangs {name}{f': did you mean {near[0]}?' if near else ''}")
     prog = " ".join(["humangs", *arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1]])
     try:
         return tyro.cli(command, prog=prog, args=options, config=(tyro.conf.FlagCreatePairsOff,))

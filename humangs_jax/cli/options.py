@@ -113,6 +113,18 @@ def described(command: type[Any]) -> type[Any]:
     return command
 
 
+def option_names(command: type[Any]) -> set[str]:
+    """The options of a command as they are typed; a flag that is on has its negative only."""
+    names, hints = set(), get_type_hints(command, include_extras=True)
+    for field in dataclasses.fields(command):
+        kind = get_args(hints[field.name])[0] if get_origin(hints[field.name]) is Annotated else hints[field.name]
+        if dataclasses.is_dataclass(kind):
+            names |= option_names(kind)
+        elif Positional not in getattr(hints[field.name], "__metadata__", ()):
+            names.add("--no-" * (field.default is True) + "--" * (field.default is not True) + field.name.replace("_", "-"))
+    return names
+
+
 def _value_shown(kind: Any) -> str | None:
     """The metavar of a type; None for one that tyro names."""
     if get_origin(kind) is Annotated:
