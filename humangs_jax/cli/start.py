@@ -22,6 +22,11 @@ MARK = "start.json"
 """In a capture folder that `humangs start` imported: a later run may replace it until it has a body, and go on from there."""
 
 
+def _without_head(limits: dict[str, Any] | None) -> dict[str, Any] | None:
+    """For cameras from the person: centimetres that they are off blur a face, and steps on the head would fit the blur."""
+    return None if limits is None else limits | {"head_steps": 0}
+
+
 @dataclasses.dataclass(frozen=True)
 class Start:
     """From photos or a video of a person to an avatar in the browser.
@@ -83,6 +88,7 @@ class Start:
         """From where an earlier run came to an end, if there was one."""
         from humangs_jax.apps.start import missing
         from humangs_jax.detection.blazepose import available
+        from humangs_jax.io.reading import read_json
 
         if self._resumes():
             with stage("reading the fit of an earlier run"):
@@ -90,7 +96,9 @@ class Start:
 
                 capture = load_capture(self.out, fit_masks=self.fit_masks)
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
-            self._finish(capture, None, limits)
+            mark = read_json(self.out / MARK)
+            estimated = isinstance(mark, dict) and mark.get("calibrated") is False
+            self._finish(capture, None, _without_head(limits) if estimated else limits)
             return
         if self.overwrite:
             tell_deleted(self.out)
@@ -134,14 +142,14 @@ class Start:
                 own_masks=own_masks,
                 reduce=not (material.keypoints or material.masks or material.alpha),
             )
-            write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
+            write_json(self.out / MARK, {"photos": str(self.photos.resolve()), "calibrated": False})
         tell("\n".join(found.lines))
         tell_found(found.people, found.person)
         for warning in found.warnings:
             warn(warning)
         wrote(self.out / SHEET_FILE, "who was found in the photos")
         material = self._with_found(material, own_masks)
-        self._finish(*self._fit(material, found.one_moment), limits)
+        self._finish(*self._fit(material, found.one_moment), _without_head(limits))
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
         """Masks and keypoints of the imported photos where there are none."""
