@@ -32,7 +32,8 @@ from humangs_jax.people.bank import build_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.people.subject import SPLITS
 from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.rendering.splatting import plan_buffers, render
+from humangs_jax.rendering.buffers import plan_buffers
+from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import tiny
 from humangs_jax.training.loop import train as train_run
 

@@ -49,7 +49,7 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0
     subjects: people that are built, posed and rendered
     size: side of the pictures
     first: first seed (training people by default)
-    worst: print so many seeds with most faults
+    worst: how many of the seeds with most faults are printed
     """
     body = load_body()
     cases = {str(first + i): functools.partial(look_at, body, first + i, size) for i in range(subjects)}

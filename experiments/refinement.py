@@ -71,10 +71,10 @@ def refinement(
         row, pictures = {}, None
         for size in sizes:
             subject = make_evaluation_subject(seed, start.body, views, size, start.held_out)
-            for count, wrong, rounds in itertools.product(views, off, iterations):
-                how = RefineConfig(iterations=rounds, poses=refine_poses)
+            for count, wrong, learned in itertools.product(views, off, iterations):
+                how = RefineConfig(iterations=learned, poses=refine_poses)
                 cell, drawn = _refined(start, with_body_off(subject, wrong), count, how, seconds)
-                also = f", {rounds} iterations" if rounds else ""
+                also = f", {learned} iterations" if learned else ""
                 row[f"{size} {count} network{also}" + (f", body {wrong:g} mm off" if wrong else "")] = cell
                 pictures = drawn if count == max(views) else pictures
         return row, pictures

@@ -24,9 +24,10 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, orbit
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers, render, render_views
+from humangs_jax.rendering.splatting import render, render_views
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 DIRECTIONS = ("forward", "forward_backward")

@@ -54,8 +54,9 @@ from humangs_jax.refinement.learned import (
 )
 from humangs_jax.refinement.objective import parameters_of, posed_gaussians
 from humangs_jax.refinement.photos import Photo
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
-from humangs_jax.rendering.splatting import plan_buffers, render
+from humangs_jax.rendering.splatting import render
 
 FIRST_SEED = 6000
 """Of the training range, after those of the shipped network."""

@@ -222,7 +222,7 @@ def training_cost(
     columns are these counts over numbers of data sheets.
 
     Options:
-    fsdp: chips that share one copy of the state; all if not given
+    fsdp: how many chips share one copy of the state; default: all
     sizes: of photos and targets, pixels
     variants: of "kept", "recomputed", "foreground", "foreground, recomputed"
     """

@@ -39,7 +39,7 @@ from .geometry.camera import Camera as Camera, look_at as look_at, orbit as orbi
 from .rendering.splatting import render as render, render_views as render_views
 from .rendering.reference import render_reference as render_reference
 from .rendering.splat_config import SplatConfig as SplatConfig, SPLAT_PRESETS as SPLAT_PRESETS
-from .rendering.splatting import plan_buffers as plan_buffers
+from .rendering.buffers import plan_buffers as plan_buffers
 from .rendering.gaussians import constrain as constrain, unconstrain as unconstrain
 
 # the network, training and scores

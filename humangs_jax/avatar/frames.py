@@ -23,9 +23,10 @@ from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.io.reading import check_limit
+from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, SPLAT_PRESETS, SplatConfig, drawn_as
-from humangs_jax.rendering.splatting import Background, BufferOverflowError, Rendering, plan_buffers, render
+from humangs_jax.rendering.splatting import Background, Rendering, render
 
 MARGIN = 1.12
 """Room around a person in the frame: the extent is measured at the centres of Gaussians."""

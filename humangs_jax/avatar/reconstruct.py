@@ -39,8 +39,8 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
 from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
+from humangs_jax.rendering.buffers import round_up
 from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.splatting import round_up
 
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2

@@ -47,9 +47,9 @@ WRAP, WRAP_ROUNDS = 0.07, 6
 """At last, vertices outside a mask move inwards up to the first, metres, until all masks contain them by the inset; the moves are
 averaged over the neighbours this often."""
 OUTSIDE, MISFIT = 0.01, 0.025
-"""A body does not fit its masks if this share of the vertices, without head and hands, is farther than so many metres outside
-of a mask. Clothes put no body there: the share of true bodies is 0, whatever they wear. Bodies that are a centimetre off have
-0.03 and more, a man whom keypoints alone have fitted 0.02 to 0.06, his fits that were refined by the masks at most 0.02."""
+"""Metres, and a share. A body does not fit its masks if more than this share of its vertices (no head, no hands) lies more than
+OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was at least 0.03 for bodies that are a
+centimetre off, 0.02 to 0.06 for a real man fitted to keypoints alone, and at most 0.02 for his fits refined by the masks."""
 LONGEST = 480
 """Pixels of the window around the person in which silhouettes are compared."""
 MARGIN = 0.12

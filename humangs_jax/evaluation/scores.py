@@ -40,7 +40,7 @@ from humangs_jax.losses.metrics import (
     similarity_map,
 )
 from humangs_jax.losses.perceptual import BACKBONES, Lpips, lpips, smallest_side
-from humangs_jax.rendering.splatting import round_up
+from humangs_jax.rendering.buffers import round_up
 
 Background = Literal["white", "black", "dataset"]
 Net = Literal["vgg", "alex", "squeeze"]

@@ -32,8 +32,8 @@ from humangs_jax.refinement.learned import Graph, graph_of, learned_update
 from humangs_jax.refinement.objective import Comparison, Parameters, compare, parameters_of
 from humangs_jax.refinement.photos import Photo, held_out_blocks, photo_order, photos_of
 from humangs_jax.refinement.steps import RefineState, init_state, step
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers
 
 T = TypeVar("T")
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
-from humangs_jax.rendering.splatting import Background, Rendering, plan_buffers, render
+from humangs_jax.rendering.splatting import Background, Rendering, render
 
 PAIRS = 4_000_000
 """(splat, tile) pairs that are drawn at once: some hundred megabytes."""

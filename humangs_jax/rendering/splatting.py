@@ -11,7 +11,6 @@ not fit is counted (`Rendering.overflow`), and eager calls raise `BufferOverflow
 
 import dataclasses
 import functools
-import logging
 from collections.abc import Callable, Sequence
 from numbers import Real
 
@@ -28,6 +27,13 @@ from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.io.images import image_row, named_color, png_bytes
+from humangs_jax.rendering.buffers import (
+    BufferOverflowError,
+    plan_buffers,
+    raise_on_overflow,
+    warn_of_overflow,
+    with_default_buffers,
+)
 from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
@@ -36,7 +42,6 @@ from humangs_jax.rendering.tiling import (
     Footprints,
     Squares,
     TileGrid,
-    count_pairs,
     depth_order,
     emit_pairs,
     footprints_by,
@@ -46,16 +51,6 @@ from humangs_jax.rendering.tiling import (
 )
 
 __all__ = ["BufferOverflowError", "Rendering", "SplatConfig", "plan_buffers", "render", "render_views", "seen_from"]
-
-
-logger = logging.getLogger(__name__)
-
-PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
-"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
-x 1024, where its 16,384 tiles add another 5 each."""
-
-STEPS_PER_OCTAVE = 4
-"""Sizes that `round_up` knows per power of two."""
 
 
 @pytree_dataclass
@@ -84,10 +79,6 @@ class Rendering(Batchable):
 
 Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None
 """(3,) RGB, three numbers in [0, 1], a CSS name or "#rrggbb"; None: white."""
-
-
-class BufferOverflowError(ValueError):
-    """A view needs larger buffers than its configuration has."""
 
 
 @checked_arguments
@@ -425,112 +416,3 @@ def _resampled(image: Array, size: int, axis: int) -> Array:
     neighbours = (jnp.asarray(i) for i in (first, np.minimum(first + 1, count - 1)))
     a, b = (jnp.moveaxis(take(jnp.moveaxis(image, axis, 0), i), 0, axis) for i in neighbours)
     return a + fraction * (b - a)
-
-
-# Buffers -------------------------------------------------------------------------------------------------------------
-
-
-def round_up(size: int, smallest: int = 64) -> int:
-    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at most a fifth is spare."""
-    size = max(size, smallest)
-    unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
-    return -(-size // unit) * unit
-
-
-def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
-    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be needed.
-
-    g: Gaussians. width, height, tile_size: pixels.
-    """
-    tiles = TileGrid(width, height, tile_size).tiles
-    return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
-
-
-def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """`config`, with `default_pairs` if it leaves `max_pairs` open; for traced calls."""
-    if config.max_pairs is not None:
-        return config
-    drawn = drawn_camera(camera, config)
-    pairs = default_pairs(gaussians.means.shape[0], drawn.width, drawn.height, config.tile_size)
-    return dataclasses.replace(config, max_pairs=pairs)
-
-
-@checked_arguments
-def plan_buffers(
-    gaussians: Gaussians,
-    cameras: Camera,
-    config: SplatConfig | str = DEFAULT_CONFIG,
-    margin: float = 1.25,
-) -> SplatConfig:
-    """A configuration with buffers for one camera, or for the most demanding one of a batch, times `margin`.
-
-    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays: call it
-    outside of transformations.
-
-    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
-    `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
-
-    Args:
-        gaussians: one set.
-        cameras: one, or a batch.
-        config: what the buffers are added to.
-        margin: how many times as many pairs as there are fit.
-
-    Returns:
-        `config` with `max_pairs` and `max_rows`.
-
-    Examples:
-        >>> config = hg.plan_buffers(gaussians, cameras, margin=2.0)
-    """
-    config = splat_config(config)
-    rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config))
-    return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
-
-
-def raise_on_overflow(overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> None:
-    """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
-    if missing := int(jnp.max(overflow, initial=0)):
-        rows, pairs = _needed(gaussians, cameras, config)
-        raise BufferOverflowError(
-            f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
-            f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
-        )
-
-
-def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
-    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks for it."""
-    if config.warn_overflow:  # else nothing is added to the program
-        warn = functools.partial(_warn, max_pairs=config.max_pairs, max_rows=config.max_rows)
-        jax.debug.callback(warn, jnp.max(overflow, initial=0))
-
-
-def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | None) -> None:
-    if missing > 0:
-        logger.warning(
-            "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s, max_rows = %s. Larger buffers: "
-            "plan_buffers with the Gaussians as they are now",
-            missing,
-            max_pairs,
-            max_rows,
-        )
-
-
-def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
-    """Most rows and most pairs that any of the views needs."""
-    gaussians, cameras = at_least_float32((gaussians, cameras))
-    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
-    return [int(most) for most in _count(gaussians, cameras, config)]
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Sequence[Array]:
-    def one(camera):
-        projected = project_gaussians(gaussians, camera, config)
-        camera = drawn_camera(camera, config)
-        footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)
-        grid = TileGrid(camera.width, camera.height, config.tile_size)
-        return count_pairs(footprints, grid)
-
-    if not cameras.batch_shape:
-        return one(cameras)
-    return [jnp.max(most, initial=0) for most in lax.map(one, cameras)]

@@ -108,7 +108,8 @@ def ablate(
         base: a run, or the name of a preset of training ("tiny", "small", "paper", "published").
         variants: fields that change, by their paths (`vary`), of each variant by its name.
         seeds: runs of each variant.
-        budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably end after it. None: all runs.
+        budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably end after it. The first one,
+            which compiles, may exceed it. None: all runs.
         people: to train on: a number of synthetic people, who are rendered during training; capture folders; or a source.
         validation: other people to compare on, likewise.
         out: folder of the runs.
@@ -150,7 +151,7 @@ def ablate(
         if seconds is not None and not finished and start - began + longest > seconds:
             continue
         config = dataclasses.replace(runs[name], seed=seed)
-        train(config, body, learned, folder, validation=compared, networks=networks, progress=False)
+        train(config, body, learned, folder, validation=compared, networks=networks, progress=progress)
         score = _score(folder, metric, config.steps)
         if score is None:
             raise ArgumentError("metric", f"{metric!r}: is none of validation: {_metrics(folder)}")

@@ -17,6 +17,7 @@ from humangs_jax.apps.start import look, missing
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.video import write_video
 from humangs_jax.cli.start import Start
+from humangs_jax.data import capture as capture_module
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.own import SeenPerson
@@ -246,6 +247,23 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     # of cameras without a common world: distances between them, over the first
     apart = lambda points: np.linalg.norm(points[1:] - points[0], axis=-1)
     np.testing.assert_allclose(apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_steps_on_the_head_are_for_calibrated_cameras(calibrated, mine, detected, monkeypatch):
+    """Those from the person are centimetres off, in the first run and in one that goes on from its body."""
+    asked = []
+    monkeypatch.setattr(Start, "_fit", lambda self, material, one_moment=None: (None, None))
+    monkeypatch.setattr(Start, "_finish", lambda self, capture, estimate, limits: asked.append(limits))
+    if not calibrated:
+        for name in ("masks", "keypoints"):
+            shutil.rmtree(mine / name)
+        (mine / "calibration.json").unlink()
+    assert cli.execute(["start", str(mine), "--out", "me"]) == 0
+    monkeypatch.setattr(Start, "_resumes", lambda self: True)
+    monkeypatch.setattr(capture_module, "load_capture", lambda path, fit_masks: None)
+    assert cli.execute(["start", str(mine), "--out", "me"]) == 0
+    assert ["head_steps" in limits for limits in asked] == [not calibrated] * 2
 
 
 def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypatch):

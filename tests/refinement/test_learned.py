@@ -30,7 +30,8 @@ from humangs_jax.refinement.learned import (
 )
 from humangs_jax.refinement.objective import parameters_of, posed_gaussians
 from humangs_jax.refinement.photos import crop_to_person, photos_of
-from humangs_jax.rendering.splatting import plan_buffers, render
+from humangs_jax.rendering.buffers import plan_buffers
+from humangs_jax.rendering.splatting import render
 
 DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a color; float32 sums over some thousand pixels
 ROUNDING = 1e-5

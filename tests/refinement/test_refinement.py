@@ -20,8 +20,9 @@ from humangs_jax.refinement.objective import Comparison, Parameters, gaussians_o
 from humangs_jax.refinement.photos import BLOCK, crop_to_person, held_out_blocks, photo_order
 from humangs_jax.refinement.search import Clock
 from humangs_jax.refinement.steps import DECAY, OPTIMIZERS, init_state, refine_views, update
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers, render
+from humangs_jax.rendering.splatting import render
 
 SAME_SIZE = 2e-3  # of alpha, in the mean: flat Gaussians become a little thicker
 SAME_GAIN = 0.05  # dB: a report counts the pixels of the crop

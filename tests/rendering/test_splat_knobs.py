@@ -10,10 +10,11 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import _resampled, plan_buffers, render, seen_from
+from humangs_jax.rendering.splatting import _resampled, render, seen_from
 
 FLOAT64 = 1e-9
 """float64 rounding, relative to the largest entry."""

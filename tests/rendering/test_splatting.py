@@ -17,16 +17,10 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, wi
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.rendering.bands import render_in_bands
+from humangs_jax.rendering.buffers import default_pairs, plan_buffers
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.reference import render_reference
-from humangs_jax.rendering.splatting import (
-    SplatConfig,
-    default_pairs,
-    draw_projected,
-    plan_buffers,
-    render,
-    render_views,
-)
+from humangs_jax.rendering.splatting import SplatConfig, draw_projected, render, render_views
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""

@@ -10,7 +10,8 @@ from splat_scenes import camera, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import stack_cameras
-from humangs_jax.rendering.splatting import SplatConfig, render, render_views, round_up
+from humangs_jax.rendering.buffers import round_up
+from humangs_jax.rendering.splatting import SplatConfig, render, render_views
 
 CONFIG = SplatConfig(max_pairs=1 << 12)
 BATCH = stack_cameras([camera(np.float32)] * 3)

@@ -145,7 +145,7 @@ class _Bytes:
         return struct.unpack_from("<" + kinds, self.data, self.at - size)
 
     def count(self, least: int) -> int:
-        """How many things follow, of at least so many bytes each."""
+        """A count of what follows; refused if the file is too short for items of `least` bytes."""
         (count,) = self.read("Q")
         self.check(count * least)
         return count

@@ -1,7 +1,7 @@
 """Which joint of a file's skeleton is which of ours: by names that are known, else by the tree.
 
 By the tree: two limbs of like bones below a joint are legs, two others above it are arms; what hangs between the arms ends in
-the head. The two longest bones of a limb in a row meet in its knee or elbow. Left and right are told by names or by places.
+the head. A knee or elbow is where the two longest consecutive bones of a limb meet. Names or places tell left from right.
 """
 
 import re
@@ -63,7 +63,7 @@ def matched(names: Sequence[str], parents: Sequence[int], rest: Places, posed: P
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Lower case, letters and digits, without what stands in front of all or many of them: "Model:Bip01_L_Thigh" is "lthigh"."""
+    """Lower-case letters and digits, without the prefixes that all or many names share: "Model:Bip01_L_Thigh" is "lthigh"."""
     words = [re.findall(r"[a-z0-9]+", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
     words = [[word for word in each if word not in NOISE] for each in words]
     plain = [re.sub(r"^mixamorig\d*", "", "".join(each)) for each in words]

@@ -97,7 +97,7 @@ class Poses(NamedTuple):
     """What a reader finds: rotations (m, 55, 3), translations (m, 3) and rate, in the world of the file, of which `up` is up.
 
     fixed: whatever the poses look like; also: other axes that are up in some files of the format, see `rules.up_axis`.
-    frames: (m,) numbers of the frames, whose gaps are filled; None: one after the other. said: what is to be told of the file.
+    frames: (m,) numbers of the frames, whose gaps are filled; None: consecutive. said: lines for the user about the file.
     """
 
     rotations: Float[np.ndarray, "m j 3"]

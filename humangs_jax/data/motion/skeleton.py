@@ -56,7 +56,7 @@ class Clip:
 
     names: of its s joints. parents: -1 for roots; parents come first. rest: (s, 3) places in the rest pose. turns: (m, s, 3, 3)
     rotation of each joint from the rest pose to the frame, in the world. places: (m, s, 3). fps: frames per second. up: the axis
-    that the format says is up; None: the rest pose tells. said: what is to be told of the file.
+    that the format says is up; None: found from the rest pose. said: lines for the user about the file.
     """
 
     names: tuple[str, ...]
