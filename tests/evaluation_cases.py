@@ -1,31 +1,11 @@
 """A tiny body and captures of it: what is compared matters, not who."""
 
-import functools
-
 import jax.numpy as jnp
 import numpy as np
+from small import small_body
 
-from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import Capture, capture_from_arrays
 from humangs_jax.losses.perceptual import BACKBONES, Convolution, Lpips, channels, convolutions
-
-
-@functools.cache
-def small_body():
-    rng = np.random.default_rng(0)
-    f32 = lambda x: jnp.asarray(x, jnp.float32)
-    regressor = rng.random((3, 6))
-    return BodyModel(
-        template=f32(rng.normal(size=(6, 3))),
-        shape_directions=f32(0.1 * rng.normal(size=(6, 3, 2))),
-        pose_directions=None,
-        joint_regressor=f32(regressor / regressor.sum(1, keepdims=True)),
-        skinning_weights=f32(np.full((6, 3), 1 / 3)),
-        faces=jnp.asarray(rng.integers(0, 6, (4, 3)), jnp.int32),
-        parents=(-1, 0, 1),
-        joint_names=("a", "b", "c"),
-        shape_names=("wide", "tall"),
-    )
 
 
 def random_lpips(net) -> Lpips:

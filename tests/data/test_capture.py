@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import tetrahedron
 
-from humangs_jax.body.model import BodyModel
 from humangs_jax.data import photos as photos_module
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.photos import check_photos, names_from_paths
@@ -19,22 +19,6 @@ from humangs_jax.io.images import write_png
 HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
 HALF_LEVEL = 0.5 / 255 + 1e-6
 """8-bit images are rounded to the nearest level."""
-
-
-def tiny_body():
-    """A tetrahedron with five joints and three shape directions."""
-    template = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    return BodyModel(
-        template=template,
-        shape_directions=jnp.ones((4, 3, 3)),
-        pose_directions=None,
-        joint_regressor=jnp.full((JOINTS, 4), 0.25),
-        skinning_weights=jnp.full((4, JOINTS), 1 / JOINTS),
-        faces=jnp.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
-        parents=(-1, 0, 1, 2, 3),
-        joint_names=tuple("abcde"),
-        name="tiny",
-    )
 
 
 def arrays(seed=0):
@@ -50,7 +34,7 @@ def arrays(seed=0):
         betas=random.normal(size=2),
         masks=random.random((VIEWS, HEIGHT, WIDTH)),
         frames=[0, 1, 1],
-        body=tiny_body(),
+        body=tetrahedron(),
     )
 
 
@@ -62,7 +46,7 @@ def folder(tmp_path):
 
 
 def load(path):
-    return load_capture(path, body=tiny_body())
+    return load_capture(path, body=tetrahedron())
 
 
 def assert_same(a, b, atol):
@@ -180,7 +164,7 @@ def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeyp
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "BODY.npz").write_bytes(b"")
     asked = []
-    monkeypatch.setattr(module, "_load_model", lambda file, name, folder=None: asked.append(name) or tiny_body())
+    monkeypatch.setattr(module, "_load_model", lambda file, name, folder=None: asked.append(name) or tetrahedron())
     a = {**arrays(), "body_file": tmp_path / "models" / "BODY.npz"}
     save_capture(tmp_path / "deep" / "er", capture_from_arrays(**a))
     assert np.load(tmp_path / "deep" / "er" / "body.npz")["body"].item() == "../../models/BODY.npz"
@@ -367,7 +351,7 @@ OWN_NAMES = ("sex", "age", "height")
 
 
 def named(names):
-    return dataclasses.replace(tiny_body(), shape_names=names)
+    return dataclasses.replace(tetrahedron(), shape_names=names)
 
 
 KINDS = {

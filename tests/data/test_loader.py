@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small import small_body
 
-from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.loading import (
     CaptureCache,
@@ -37,21 +37,7 @@ LEVELS = 20  # view i of subject s is one flat grey, byte 20 s + i
 SAMPLING = ViewSampling(input_counts=(2,), target_count=2)
 
 
-def small_body():
-    template = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
-    weights = np.eye(2, dtype=np.float32)[np.arange(8) % 2]
-    return BodyModel(
-        template=jnp.asarray(template),
-        shape_directions=jnp.zeros((8, 3, 4)),
-        pose_directions=None,
-        joint_regressor=jnp.full((2, 8), 1 / 8),
-        skinning_weights=jnp.asarray(weights),
-        faces=jnp.asarray([[0, 1, 2], [3, 4, 5]]),
-        parents=(-1, 0),
-        joint_names=("root", "child"),
-        shape_names=("a", "b", "c", "d"),
-        name="small",
-    )
+BODY = small_body(8, 2, 4)
 
 
 def write_subject(path, seed, views=VIEWS, masks=True):
@@ -66,11 +52,11 @@ def write_subject(path, seed, views=VIEWS, masks=True):
         generator.normal(size=(POSES, 2, 3)) * 0.1,
         generator.normal(size=(POSES, 3)) * 0.1,
         betas=[0.5, -0.5],
-        shape_names=("a", "b"),
+        shape_names=("wide", "tall"),
         masks=np.ones((views, SIZE, SIZE)) if masks else None,
         frames=np.arange(views) % POSES,
         background="white",
-        body=small_body(),
+        body=BODY,
     )
     save_capture(path, capture)
 
@@ -94,7 +80,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def source(folder):
-    return loader_of(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    return loader_of(CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2)
 
 
 def greys(views):
@@ -113,7 +99,7 @@ def fake_subject(views, poses, seed=0):
 
 
 def test_batches_are_a_function_of_seed_and_step(folder, source):
-    again = loader_of(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    again = loader_of(CaptureCache(find_captures(folder), BODY), SAMPLING, SIZE, SIZE // 2, batch_size=2)
     again.batch_at(9)  # whatever was asked for before must not matter
     assert same(source.batch_at(5), again.batch_at(5))
     assert not same(source.batch_at(5), source.batch_at(6))
@@ -126,7 +112,7 @@ def test_a_pass_shows_every_subject_once(source):
 
 
 def test_views_carry_their_own_pose_camera_and_size(folder, source):
-    stored = stored_subject(folder / "s3", small_body())
+    stored = stored_subject(folder / "s3", BODY)
     for index in range(4):
         example = source.source.example(0, index, 2)
         assert example.inputs.images.shape == (2, SIZE, SIZE, 3)
@@ -195,7 +181,7 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
     write_subject(tmp_path / "torn", 7)
     next((tmp_path / "torn").glob("images/*")).write_bytes(b"no image")
     folders = (*find_captures(tmp_path), folder / "s1")
-    source = loader_of(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    source = loader_of(CaptureCache(folders, BODY), SAMPLING, SIZE, SIZE)
     with caplog.at_level(logging.WARNING):
         for index in range(8):
             assert greys(source.source.example(0, index, 2).inputs)[0][0] == 1
@@ -213,16 +199,16 @@ def test_captures_of_another_body_are_left_out(tmp_path):
     file = tmp_path / "smplx" / "body.npz"
     with np.load(file) as arrays:
         np.savez(file, **{**arrays, "body": "../SMPLX_NEUTRAL.npz"})
-    source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
+    source = loader_of(CaptureCache(find_captures(tmp_path), BODY), SAMPLING, SIZE, SIZE)
     assert [greys(source.source.example(0, index, 2).inputs)[0][0] for index in range(4)] == [1] * 4
     assert "body: '../SMPLX_NEUTRAL.npz', but all captures of a run" in source.source.cache.broken[tmp_path / "smplx"]
-    others = CaptureCache(find_captures(tmp_path), small_body(), body_file=tmp_path / "SMPLX_NEUTRAL.npz")
+    others = CaptureCache(find_captures(tmp_path), BODY, body_file=tmp_path / "SMPLX_NEUTRAL.npz")
     assert others.summary(1) is not None and others.summary(0) is None
 
 
 def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
     write_subject(tmp_path / "few", 5, views=3)
-    source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
+    source = loader_of(CaptureCache(find_captures(tmp_path), BODY), SAMPLING, SIZE, SIZE)
     with pytest.raises(ValueError, match=r"none of the 1 capture folders can be used.*need 4"):
         next(source.batches(0, 1))
 
@@ -239,7 +225,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
     examples = lambda cache: [loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)]
-    cache = CaptureCache(find_captures(folder), small_body(), limit_bytes=limit)
+    cache = CaptureCache(find_captures(folder), BODY, limit_bytes=limit)
     first = examples(cache)
     counts = [len(read)]
     again = examples(cache)
@@ -252,7 +238,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
         assert counts == [distinct, 0]
     else:  # of 20 views there is room
         assert counts[1] < counts[0] <= drawn and counts[1] > 0
-    stored = [stored_subject(path, small_body()) for path in find_captures(folder)]
+    stored = [stored_subject(path, BODY) for path in find_captures(folder)]
     for batch, same_batch in zip(first, again, strict=True):
         assert same(batch, same_batch)
         for (subject, view), image in zip(
@@ -274,7 +260,7 @@ def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folde
         return read_view(path, *arguments)
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
-    new = lambda: loader_of(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    new = lambda: loader_of(CaptureCache(folders, BODY), SAMPLING, SIZE, SIZE)
     whole = new()
     examples = [whole.source.example(0, i, 2) for i in range(40)]
     subjects = [greys(example.inputs)[0][0] for example in examples]
@@ -288,7 +274,7 @@ def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folde
 def test_views_whose_mask_is_empty_are_targets_but_no_inputs(folder, tmp_path):
     write_subject(tmp_path / "s2", 2)
     write_png(tmp_path / "s2/masks/003.png", np.zeros((SIZE, SIZE)))
-    source = loader_of(CaptureCache((folder / "s0", tmp_path / "s2"), small_body()), SAMPLING, SIZE, SIZE).source
+    source = loader_of(CaptureCache((folder / "s0", tmp_path / "s2"), BODY), SAMPLING, SIZE, SIZE).source
     examples = [source.example(0, i, 2) for i in range(60)]
     assert (2, 3) not in {view for example in examples for view in greys(example.inputs)}
     assert (2, 3) in {view for example in examples for view in greys(example.targets)}
@@ -297,7 +283,7 @@ def test_views_whose_mask_is_empty_are_targets_but_no_inputs(folder, tmp_path):
 
 def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("humangs_jax.data.photos.read_view", None)
-    whole = read_summary(folder / "s1", small_body())
+    whole = read_summary(folder / "s1", BODY)
     assert whole.images.shape == (0, SIZE, SIZE, 3) and whole.frames.tolist() == [0, 1, 0, 1, 0, 1]
 
     def broken(change):
@@ -305,7 +291,7 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
         shutil.copytree(folder / "s1", root)
         change(root)
         with pytest.raises(ValueError) as error:
-            read_summary(root, small_body())
+            read_summary(root, BODY)
         return str(error.value)
 
     def flip(root):
@@ -335,7 +321,7 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
 
 
 def test_some_views_of_a_capture(folder):
-    whole, some = (load_capture(folder / "s1", body=small_body(), views=v) for v in (None, [4, 1]))
+    whole, some = (load_capture(folder / "s1", body=BODY, views=v) for v in (None, [4, 1]))
     np.testing.assert_array_equal(some.images, whole.images[[4, 1]])
     np.testing.assert_array_equal(some.masks, whole.masks[[4, 1]])
     np.testing.assert_array_equal(some.cameras.cam_from_world, whole.cameras.cam_from_world[jnp.asarray([4, 1])])
@@ -385,6 +371,6 @@ def test_the_window_rule_scales_with_the_number_of_views(count):
 
 def test_the_window_rule_is_a_function_of_seed_and_step(folder):
     sampling = ViewSampling(input_counts=(2,), target_count=2, rule="window")
-    source = lambda: loader_of(CaptureCache(find_captures(folder), small_body()), sampling, SIZE, SIZE)
+    source = lambda: loader_of(CaptureCache(find_captures(folder), BODY), sampling, SIZE, SIZE)
     assert all(same(source().source.example(0, i, 2), source().source.example(0, i, 2)) for i in range(5))
     assert not same(source().source.example(0, 0, 2), source().source.example(0, 3, 2))

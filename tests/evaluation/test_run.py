@@ -7,7 +7,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evaluation_cases import capture_from, random_views, small_body
+from evaluation_cases import capture_from, random_views
+from small import small_body
 
 import humangs_jax as hg
 from humangs_jax.core.pytree import replace

@@ -11,38 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
+from small import tetrahedron
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.model import BodyModel
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.fitting.files import KEYS, OPTIONAL
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.network.weights import expected_variables, save_weights
 from humangs_jax.people.subject import GENERATOR_VERSION
-from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.training.config import tiny
 
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]
 POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0.9], [0, 0, -1, 2.6], [0, 0, 0, 1]]
 VIEWS = ("000", "001")
-
-
-@functools.cache
-def tiny_body():
-    template = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    return BodyModel(
-        template=template,
-        shape_directions=jnp.ones((4, 3, 3)),
-        pose_directions=None,
-        joint_regressor=jnp.full((5, 4), 0.25),
-        skinning_weights=jnp.full((4, 5), 0.2),
-        faces=jnp.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
-        parents=(-1, 0, 1, 2, 3),
-        joint_names=tuple("abcde"),
-        shape_names=tuple("xyz"),
-        name="tiny",
-    )
+tiny_body = functools.partial(tetrahedron, tuple("xyz"))
 
 
 def saved(name, write):
@@ -337,12 +320,6 @@ def write_easymocap_motion(folder):
     for i in range(3):
         (folder / f"{i:06d}.json").write_text(json.dumps([person]))
     return folder
-
-
-def splats(k=3):
-    """Gaussians with harmonics."""
-    some = lambda *shape: jnp.asarray(np.random.default_rng(4).random((12, *shape)), jnp.float32)
-    return Gaussians(some(3), some(4), some(3), some(), some(3), harmonics=some(k, 3) if k else None)
 
 
 def text_ply():

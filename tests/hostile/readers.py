@@ -17,6 +17,7 @@ from honest_files import data_set, npz, saved, written
 from joblib_files import joblib
 from PIL import Image
 from safetensors.numpy import save_file
+from small import random_gaussians
 from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
@@ -239,12 +240,12 @@ ROWS = {
     "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
     "glb motion": (load_motion, saved("m.glb", honest.write_glb_motion)),
-    "3dgs": (load_gaussians, saved("a.ply", lambda path: save_gaussians(path, honest.splats()))),
+    "3dgs": (load_gaussians, saved("a.ply", lambda path: save_gaussians(path, random_gaussians(harmonics=3)))),
     "3dgs text": (load_gaussians, written("a.ply", honest.text_ply)),
     "3dgs compressed": (load_gaussians, written("a.ply", honest.compressed_ply)),
-    "splat": (load_gaussians, saved("a.splat", lambda path: save_gaussians(path, honest.splats(0)))),
-    "spz": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, honest.splats(15)))),
-    "glb splats": (load_gaussians, saved("a.glb", lambda path: save_gaussians(path, honest.splats(8)))),
+    "splat": (load_gaussians, saved("a.splat", lambda path: save_gaussians(path, random_gaussians()))),
+    "spz": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=15)))),
+    "glb splats": (load_gaussians, saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8)))),
     "obj": (colored_mesh, honest.write_obj),
     "ply": (colored_mesh, honest.mesh("ply")),
     "glb": (colored_mesh, written("scan.glb", honest.textured_glb)),

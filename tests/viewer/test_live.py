@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from viewer_cases import small_avatar
+from small import small_avatar
 
 from experiments import chromium
 from humangs_jax.core.pytree import replace

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from viewer_cases import small_avatar, small_body
+from small import small_avatar, small_body
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import Light

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from command_line import run
-from viewer_cases import small_avatar
+from small import small_avatar
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.library import load_body
