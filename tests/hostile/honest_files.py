@@ -8,7 +8,6 @@ import struct
 import bvh_files
 import dataset_files
 import jax
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from small import tetrahedron
