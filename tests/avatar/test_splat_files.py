@@ -7,6 +7,7 @@ import struct
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import random_gaussians
 
 import humangs_jax as hg
 from humangs_jax.core.pytree import replace
@@ -27,12 +28,9 @@ STEPS = {
 
 def scene(count=0, g=20, seed=0) -> Gaussians:
     """In the order in which `.splat` has them: the largest first."""
-    rng = np.random.default_rng(seed)
-    scales, opacities = np.exp(rng.normal(size=(g, 3)) - 3), rng.uniform(0.05, 0.95, g)
-    order = np.argsort(-opacities * scales.prod(axis=1))
-    arrays = (rng.normal(size=(g, 3)), rng.normal(size=(g, 4)), scales[order], opacities[order], rng.random((g, 3)))
-    harmonics = jnp.asarray(rng.uniform(-0.9, 0.9, (g, count, 3)), jnp.float32) if count else None
-    return Gaussians(*(jnp.asarray(array, jnp.float32) for array in arrays), harmonics=harmonics)
+    gaussians = random_gaussians(seed, g, count)
+    order = jnp.argsort(-gaussians.opacities * gaussians.scales.prod(axis=1))
+    return replace(gaussians, scales=gaussians.scales[order], opacities=gaussians.opacities[order])
 
 
 def assert_close(found, expected, steps):
