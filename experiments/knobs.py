@@ -1,11 +1,18 @@
 """docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself."""
 
+import ast
 import dataclasses
+import functools
+import inspect
+import itertools
+import textwrap
+import typing
 from typing import Any
 
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY
 from humangs_jax.apps.settings import PRESETS, Settings
+from humangs_jax.core.configuration import Range, field_paths, in_words, marks_in
 from humangs_jax.network.config import Conventions
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.runtime import Runtime
@@ -14,6 +21,7 @@ from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.training.config import PRESETS as RUNS
 from humangs_jax.training.config import TrainConfig
 
 PAGE = REPOSITORY / "docs" / "knobs.md"
@@ -25,6 +33,15 @@ The linked page has the measurement and its conditions.
 
 | knob | default | costs | buys | measured in |
 |---|---|---|---|---|
+"""
+FIELDS_HEAD = """
+## Field paths
+
+What `hg.vary` and the `config.json` of a run name: all fields of a `TrainConfig`, with the values of the preset `tiny`. Without
+`model.` they are those of a `HumanGSConfig`, which `hg.load_weights` returns. A part of another kind has other fields.
+
+| path | may be | `tiny` has | what |
+|---|---|---|---|
 """
 PRESETS_HEAD = """
 ## Presets
@@ -51,7 +68,17 @@ def page() -> str:
         Settings,
     )
     rows = [row for cls in classes for row in knob_rows(cls)]
-    return HEAD + "\n".join(rows) + "\n" + PRESETS_HEAD + "\n".join(preset_rows()) + "\n"
+    return (
+        HEAD
+        + "\n".join(rows)
+        + "\n"
+        + PRESETS_HEAD
+        + "\n".join(preset_rows())
+        + "\n"
+        + FIELDS_HEAD
+        + "\n".join(field_rows())
+        + "\n"
+    )
 
 
 def preset_rows() -> list[str]:
@@ -67,6 +94,38 @@ def preset_rows() -> list[str]:
         own, network = ", ".join(changes(preset, plain[0])), ", ".join(changes(preset.runtime, plain[1]))
         rows.append(f"| `{name}` | {own} | {network or 'as trained'} |")
     return rows
+
+
+def field_rows() -> list[str]:
+    """A row for each field of a training run that holds no others."""
+    run = RUNS["tiny"]()
+    rows = []
+    for path, value in field_paths(run).items():
+        if dataclasses.is_dataclass(value):
+            continue
+        *places, name = path.split(".")
+        cls = type(functools.reduce(getattr, places, run))
+        hint = typing.get_type_hints(cls, include_extras=True)[name]
+        ranges = "; ".join(dict.fromkeys(map(str, marks_in(hint, Range))))
+        allowed = in_words(typing.get_type_hints(cls)[name]) + (f", {ranges}" if ranges else "")
+        cells = (f"`{path}`", allowed, f"`{value}`", docstrings(cls).get(name, ""))
+        rows.append(f"| {' | '.join(' '.join(cell.split()).replace('|', 'or') for cell in cells)} |")
+    return rows
+
+
+@functools.cache
+def docstrings(cls: type) -> dict[str, str]:
+    """The strings below the fields of a class, by field."""
+    found = {}
+    for each in cls.__mro__[-2::-1]:
+        if not dataclasses.is_dataclass(each) or not each.__module__.startswith("humangs_jax"):
+            continue
+        (written,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        assert isinstance(written, ast.ClassDef)
+        for field, text in itertools.pairwise(written.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                found[ast.unparse(field.target)] = str(text.value.value)
+    return found
 
 
 def knob_rows(cls: Any) -> list[str]:

@@ -43,7 +43,8 @@ _USUAL_UP = f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').s
 class Demo:
     """Try everything on the shipped person.
 
-    Reconstructs, refines, renders held-out views, animates, and writes the avatar.
+    Reconstructs, refines, renders held-out views, animates, and writes the avatar. The same command goes on after an
+    interruption.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

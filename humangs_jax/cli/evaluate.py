@@ -1,15 +1,21 @@
 """`humangs evaluate`: scores of reconstructions, avatars or any program's images under a protocol."""
 
 import dataclasses
+import hashlib
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
 from humangs_jax.cli.options import Place, UsageError
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import at_least
+
+KEPT_SECONDS = 30 * 24 * 3600.0
+"""For which the scores of an interrupted evaluation are kept."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Evaluate:
     """Score novel views of people against photos: PSNR, SSIM, LPIPS.
 
     Of weights (people are reconstructed from some photos and compared on the others), of avatars, or of images that any program
-    rendered. Protocols of papers: docs: evaluation.
+    rendered. The same command goes on after an interruption. Protocols of papers: docs: evaluation.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -78,6 +84,9 @@ class Evaluate:
                 if len(found) > 2:
                     raise UsageError(f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}")
                 networks.append(load_lpips(net, *found))
+        keep = self._kept()
+        if keep is not None and (scored := len(list(keep.glob("person_*.json")))):
+            tell(f"going on: {scored} {'person is' if scored == 1 else 'people are'} scored")
         with stage("evaluating"):
             result = evaluate(
                 self.source,
@@ -90,15 +99,40 @@ class Evaluate:
                 lpips=networks,
                 body=self.body,
                 page_images=self.page_images if self.html is not None else 0,
+                keep=keep,
                 progress=True,
             )
         tell(result.summary())
         result.write(**files)
+        if keep is not None:
+            shutil.rmtree(keep, ignore_errors=True)
         for name, path in files.items():
             if path is not None:
                 wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))
         if self.html is None:
             suggest("humangs evaluate", self.source, *self._given(), "--html scores.html")
+
+    def _kept(self) -> Path | None:
+        """A folder in the user's cache, that of the same command on the same files; None where nothing can be written."""
+        from humangs_jax import __version__
+        from humangs_jax.core.compiling import user_cache
+
+        named = [self.source, self.avatar, self.weights, self.predictions, self.indices, self.body]
+        named += [file for files in vars(self.lpips).values() for file in files]
+        said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None and self.page_images]
+        for path in named:
+            files = [] if path is None else [path, *path.glob("*"), *path.glob("*/*")]
+            said += [(str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files if file.exists()]
+        try:
+            root = user_cache() / "humangs_jax" / "evaluations"
+            folder = root / hashlib.sha256(repr(said).encode()).hexdigest()[:16]
+            folder.mkdir(parents=True, exist_ok=True)
+            for other in root.iterdir():
+                if time.time() - other.stat().st_mtime > KEPT_SECONDS:
+                    shutil.rmtree(other, ignore_errors=True)
+        except (OSError, RuntimeError):  # RuntimeError: no home
+            return None
+        return folder
 
     def _given(self) -> Iterator[str | Path]:
         """The options that say what is evaluated and how, as they were given."""

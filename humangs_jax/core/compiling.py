@@ -43,7 +43,7 @@ def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None
     if given := _folder_of_jax():
         return Path(given)
     try:
-        root = Path(folder or wish or _user_cache() / "humangs_jax").expanduser()
+        root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
         cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{_processor()}"
         cache.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
@@ -60,7 +60,8 @@ def _folder_of_jax() -> str | None:
     return sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX)
 
 
-def _user_cache() -> Path:
+def user_cache() -> Path:
+    """The user's cache folder, as the platform has it. Raises: RuntimeError without a home."""
     if folder := os.environ.get("XDG_CACHE_HOME"):
         return Path(folder)
     if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):

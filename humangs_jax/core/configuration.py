@@ -11,6 +11,7 @@ A field annotated with a class of `Part` may hold any `part` that derives from i
 """
 
 import dataclasses
+import difflib
 import functools
 import json
 import numbers
@@ -131,7 +132,7 @@ def check_fields(config: Any) -> None:
     """
     for name, annotation in _annotations(type(config)).items():
         if name in field_names(type(config)) and not _fits(value := getattr(config, name), annotation):
-            raise ValueError(f"{type(config).__name__}: {name}: expected {_in_words(annotation)}, got {value!r}")
+            raise ValueError(f"{type(config).__name__}: {name}: expected {in_words(annotation)}, got {value!r}")
 
 
 @functools.cache
@@ -154,7 +155,8 @@ def _fits(value: Any, annotation: Any) -> bool:
     return origin is not tuple or isinstance(value, tuple)
 
 
-def _in_words(annotation: Any) -> str:
+def in_words(annotation: Any) -> str:
+    """What an annotation allows, for a message."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     words = []
     for option in typing.get_args(annotation) if union else [annotation]:
@@ -231,23 +233,38 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
         The changed copy.
 
     Raises:
-        ValueError: naming the path, for a field that does not exist, and as the configuration's own checks.
+        ValueError: naming the path, and those that are like it, for a field that does not exist; and as the configuration's own
+            checks. docs/knobs.md lists all paths.
 
     Examples:
         >>> hg.vary(config, {"model.architecture.encoder.transformer.class_token": False, "loss.squared": 0.5})
     """
     for path, value in changes.items():
-        config = _varied(config, path.split("."), value, path)
+        known = field_paths(config)
+        if path not in known:
+            last = path.rpartition(".")[2]
+            same = [each for each in known if each.rpartition(".")[2] == last]
+            like = same or difflib.get_close_matches(path, known, cutoff=0.7)
+            meant = f"; did you mean {' or '.join(like[:3])}?" if like else ""
+            raise ValueError(f"{path}: {type(config).__name__} has no such field{meant} (all paths: docs/knobs.md)")
+        config = _varied(config, path.split("."), value)
     return config
 
 
-def _varied(config: Any, names: list[str], value: Any, path: str) -> Any:
-    fields = field_names(type(config)) if dataclasses.is_dataclass(config) else ()
-    if names[0] not in fields:
-        raise ValueError(f"{path}: {type(config).__name__} has no field {names[0]!r}; its fields are {list(fields)}")
-    if names[1:]:
-        value = _varied(getattr(config, names[0]), names[1:], value, path)
-    return dataclasses.replace(config, **{names[0]: value})
+def field_paths(config: Any, before: str = "") -> dict[str, Any]:
+    """All fields of a configuration by path, those of nested ones too, with their values."""
+    found: dict[str, Any] = {}
+    for name in field_names(type(config)):
+        value = getattr(config, name)
+        found[before + name] = value
+        if dataclasses.is_dataclass(value):
+            found |= field_paths(value, f"{before}{name}.")
+    return found
+
+
+def _varied(config: Any, names: list[str], value: Any) -> Any:
+    changed = _varied(getattr(config, names[0]), names[1:], value) if names[1:] else value
+    return dataclasses.replace(config, **{names[0]: changed})
 
 
 def check_range(cls: type, name: str, value: Any, path: str) -> None:

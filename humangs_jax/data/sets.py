@@ -25,7 +25,7 @@ class SetFormat(NamedTuple):
 
 
 SYNTHETIC, DATA_SET = SetFormat("humangs-synthetic", 2), SetFormat("humangs-dataset", 1)
-AVATARS = SetFormat("humangs-avatars", 1)
+AVATARS, SCORES = SetFormat("humangs-avatars", 1), SetFormat("humangs-scores", 1)
 
 
 def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from humangs_jax.core.progress import bar, printable
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
+from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
 from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
 from humangs_jax.evaluation.scores import (
@@ -53,7 +54,7 @@ from humangs_jax.evaluation.tables import (
 )
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.images import resized, to_uint8
-from humangs_jax.io.reading import json_text
+from humangs_jax.io.reading import json_text, read_json, write_json
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
@@ -78,25 +79,28 @@ class Gallery:
         self._limit = limit
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
-    def add(self, row: int, psnr: float | None, truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]) -> None:
-        """An image and its truth; row: its number among the rows."""
+    def add(self, row: int, psnr: float | None, images: Callable[[], dict[str, str]]) -> None:
+        """An image, see `_shot`; row: its number among the rows."""
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self._limit and (not self._shots or key <= self._shots[0][0]):
             return
-        ours = np.clip(ours, 0, 1)
-        error = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
-        images = {"truth": truth, "ours": ours, "error": error}
-        shot = (key, row, {name: _data_url(image, SIDE) for name, image in images.items()})
-        (heapq.heappushpop if len(self._shots) >= self._limit else heapq.heappush)(self._shots, shot)
+        (heapq.heappushpop if len(self._shots) >= self._limit else heapq.heappush)(self._shots, (key, row, images()))
 
-    def add_inputs(self, person: str, images: Float[np.ndarray, "v h w 3"]) -> None:
-        """What the method saw of a person."""
-        self.inputs[person] = [_data_url(image, INPUT_SIDE) for image in images] if self._limit else []
+    def small_inputs(self, images: Float[np.ndarray, "v h w 3"]) -> list[str]:
+        """What the method saw of a person, if a page is made."""
+        return [_data_url(image, INPUT_SIDE) for image in images] if self._limit else []
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
         """By row."""
         return {row: images for _, row, images in self._shots}
+
+
+def _shot(truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]) -> dict[str, str]:
+    """Truth, ours and error, small."""
+    ours = np.clip(ours, 0, 1)
+    images = {"truth": truth, "ours": ours, "error": error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)}
+    return {name: _data_url(image, SIDE) for name, image in images.items()}
 
 
 def _data_url(image: np.ndarray, side: int) -> str:
@@ -250,6 +254,7 @@ def evaluate(
     lpips: Sequence[Lpips] = (),
     body: BodyModel | str | Path | None = None,
     page_images: int = PAGE_IMAGES,
+    keep: str | Path | None = None,
     progress: bool = False,
 ) -> Evaluation:
     """Score a method on the people of a source: novel views against photos.
@@ -269,6 +274,7 @@ def evaluate(
             otherwise their LPIPS is None, and the reason is reported.
         body: the model that the parameters belong to, or its file.
         page_images: how many images are kept for the HTML page, the worst ones.
+        keep: a folder for the scores of finished people, so that the same call goes on after an interruption.
         progress: show a bar.
 
     Returns:
@@ -287,47 +293,78 @@ def evaluate(
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
     people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
-    rows, missing, sides, shown_inputs = [], [], set(), []
-    masks, alphas, everything = True, True, False
-    gallery = Gallery(page_images)
+    kept = None if keep is None else Path(keep)
+    if kept is not None:
+        said = {
+            "name": name,
+            "protocol": repr(rules),
+            "people": len(people.names),
+            "lpips": sorted(networks),
+            "images": page_images,
+        }
+        begin_set(kept, SCORES, {SETTINGS: said})
+    rows, missing, scored, gallery = [], [], [], Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
-        case = people.load(index)
-        predicted = _without_nobody(case, predict(case, rules.behind))
-        person = printable(case.name)  # of a folder: every report gets a name of one line
-        missing += map(printable, predicted.missing)
-        if not predicted.views:
-            continue
-        truth = case.truth.select(predicted.views)
-        masks, alphas = masks and truth.masks is not None, alphas and predicted.alpha is not None
-        everything |= case.inputs is None and isinstance(source, str | Path | Capture)
-        sides.add(truth.images.shape[2:0:-1])
-        if case.inputs is not None:
-            gallery.add_inputs(person, case.inputs.images)
-            shown_inputs.append(case.inputs.view_count)
-        try:
-            scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
-        except ValueError as error:
-            raise ValueError(f"{person}: {error}") from error
-        for i, scores in enumerate(scored):
-            row = Scored(person, int(truth.frames[i]), printable(truth.names[i]), scores)
-            mask = None if truth.masks is None else truth.masks[i]
-            gallery.add(len(rows), scores["psnr"], on_background(truth.images[i], mask, rules), predicted.images[i])
-            rows.append(row)
+        file = None if kept is None else kept / f"person_{index}.json"
+        if file is not None and file.is_file():
+            person = read_json(file)
+            for i, shot in person["shots"]:
+                gallery.add(len(rows) + i, person["rows"][i][-1]["psnr"], functools.partial(dict, shot))
+        else:
+            person = _score_person(people.load(index), predict, rules, networks, gallery, len(rows))
+            if file is not None:
+                file.parent.mkdir(exist_ok=True)  # gone, where the same call in another process has ended
+                write_json(file, person)
+        missing += person["missing"]
+        if person["rows"]:
+            rows += [Scored(*row) for row in person["rows"]]
+            gallery.inputs[rows[-1].person] = person["input_images"]
+            scored.append(person)
     if not rows:
         raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
     people_shown = {row.person for row in rows}
     about = {
         "source": printable(source) if isinstance(source, str | Path) else type(source).__name__,
         "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
-        "sides": sorted(map(list, sides)),
-        "inputs": sorted(set(shown_inputs)),
-        "everything": everything,
+        "sides": sorted({tuple(person["side"]) for person in scored}),
+        "inputs": sorted({person["inputs"] for person in scored} - {None}),
+        "everything": isinstance(source, str | Path | Capture) and any(person["inputs"] is None for person in scored),
     }
-    reasons = missing_reasons(rules, networks, masks, alphas)
+    has = {part: all(person[part] for person in scored) for part in ("masks", "alpha")}
+    reasons = missing_reasons(rules, networks, has["masks"], has["alpha"])
     unknown = [score for score in score_names(rules) if all(row.scores[score] is None for row in rows)]
     reasons |= {score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons}
     label = protocol if isinstance(protocol, str) else "custom"
     return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+
+
+def _score_person(
+    case: Case, predict: Method, rules: EvaluationProtocol, networks: dict[str, Lpips], gallery: Gallery, first: int
+) -> dict[str, Any]:
+    """What there is to say of a person, as JSON has it; its images go to the gallery. first: number of its first row."""
+    predicted, name = _without_nobody(case, predict(case, rules.behind)), printable(case.name)  # of a folder: now one line
+    about: dict[str, Any] = {"missing": [printable(file) for file in predicted.missing], "rows": [], "shots": []}
+    if not predicted.views:
+        return about
+    truth = case.truth.select(predicted.views)
+    try:
+        scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    for i, scores in enumerate(scored):
+        mask = None if truth.masks is None else truth.masks[i]
+        shot = functools.partial(_shot, on_background(truth.images[i], mask, rules), predicted.images[i])
+        gallery.add(first + i, scores["psnr"], shot)
+        about["rows"].append([name, int(truth.frames[i]), printable(truth.names[i]), scores])
+    shots = gallery.shots
+    return about | {
+        "shots": [[i, shots[first + i]] for i in range(len(scored)) if first + i in shots],
+        "masks": truth.masks is not None,
+        "alpha": predicted.alpha is not None,
+        "side": truth.images.shape[2:0:-1],
+        "inputs": None if case.inputs is None else case.inputs.view_count,
+        "input_images": [] if case.inputs is None else gallery.small_inputs(case.inputs.images),
+    }
 
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:

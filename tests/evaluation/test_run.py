@@ -16,6 +16,7 @@ from humangs_jax.data.capture import save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.evaluation import run as evaluation
 from humangs_jax.evaluation.cases import Case, Predicted, _short_names, find_people, spread_views
 from humangs_jax.io.images import write_png
 
@@ -87,6 +88,28 @@ def test_a_page_keeps_the_worst(people):
     found = hg.evaluate(cases(people), method=predicting(people), page_images=3)
     order = np.argsort([row.scores["psnr"] for row in found.rows])
     assert set(found.gallery.shots) == set(order[:3].tolist())
+
+
+def test_people_who_are_scored_are_kept(people, tmp_path):
+    """An interrupted call leaves them; the same call goes on and finds what an undisturbed one does."""
+    asked, stop = [], ["bob"]
+
+    def method(case, background):
+        asked.append(case.name)
+        if case.name in stop:
+            raise KeyboardInterrupt
+        return predicting(people)(case, background)
+
+    run = lambda **options: hg.evaluate(cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options})
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    stop.clear()
+    found, plain = run(), hg.evaluate(cases(people), method=predicting(people), page_images=5)
+    assert asked == ["ann", "bob", "bob"]
+    assert found.rows == plain.rows and found.about == plain.about and found.reasons == plain.reasons
+    assert found.gallery.shots == plain.gallery.shots and found.gallery.inputs == plain.gallery.inputs
+    with pytest.raises(ValueError, match=r"written with settings other than asked for now \(images 5 -> 6\)"):
+        run(page_images=6)
 
 
 def write_predictions(folder, people, alpha=False):
@@ -303,3 +326,31 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
             found = [row.scores["psnr"] for row in nobody.rows]
             np.testing.assert_allclose(found, [psnr(x, np.ones_like(x)) for x in expected], atol=1e-3)
         assert nobody.means["iou"].mean == 0
+
+
+def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, humangs):
+    """Where its files are as they were."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_predictions(tmp_path / "theirs", people, alpha=True)
+    scored, interrupting = [], [True]
+    score = evaluation.score_views
+
+    def score_views(predicted, truth, *rest):
+        if scored and interrupting:
+            raise KeyboardInterrupt
+        scored.append(truth)
+        return score(predicted, truth, *rest)
+
+    monkeypatch.setattr(evaluation, "score_views", score_views)
+    run = lambda *options: humangs("evaluate", folders, "--predictions", tmp_path / "theirs", *options)
+    kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
+    assert run()[0] == 130 and kept() == ["person_0.json"]
+    interrupting.clear()
+    code, out, _ = run("--csv", tmp_path / "a.csv")
+    assert code == 0 and "going on: 1 person is scored" in out and len(scored) == 2 and kept() == []
+    interrupting.append(True)
+    scored.clear()
+    assert run()[0] == 130 and kept() == ["person_0.json"]
+    write_png(tmp_path / "theirs" / "ann" / "new.png", np.zeros((8, 8, 3)))
+    interrupting.clear()
+    assert "going on" not in run()[1] and len(scored) == 3
