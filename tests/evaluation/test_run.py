@@ -11,6 +11,7 @@ from evaluation_cases import capture_from, random_views
 from small import small_body
 
 import humangs_jax as hg
+from humangs_jax import cli
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
@@ -328,7 +329,7 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
         assert nobody.means["iou"].mean == 0
 
 
-def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, humangs):
+def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, capsys):
     """Where its files are as they were."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_predictions(tmp_path / "theirs", people, alpha=True)
@@ -342,15 +343,15 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
         return score(predicted, truth, *rest)
 
     monkeypatch.setattr(evaluation, "score_views", score_views)
-    run = lambda *options: humangs("evaluate", folders, "--predictions", tmp_path / "theirs", *options)
+    run = lambda *more: cli.execute(["evaluate", str(folders), "--predictions", str(tmp_path / "theirs"), *more])
     kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
-    assert run()[0] == 130 and kept() == ["person_0.json"]
+    assert run() == cli.INTERRUPTED and kept() == ["person_0.json"]
     interrupting.clear()
-    code, out, _ = run("--csv", tmp_path / "a.csv")
-    assert code == 0 and "going on: 1 person is scored" in out and len(scored) == 2 and kept() == []
+    assert run("--csv", str(tmp_path / "a.csv")) == 0 and len(scored) == 2 and kept() == []
+    assert "going on: 1 person is scored" in capsys.readouterr().out
     interrupting.append(True)
     scored.clear()
-    assert run()[0] == 130 and kept() == ["person_0.json"]
+    assert run() == cli.INTERRUPTED and kept() == ["person_0.json"]
     write_png(tmp_path / "theirs" / "ann" / "new.png", np.zeros((8, 8, 3)))
     interrupting.clear()
-    assert "going on" not in run()[1] and len(scored) == 3
+    assert run() == 0 and len(scored) == 3 and "going on" not in capsys.readouterr().out
