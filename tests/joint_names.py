@@ -30,11 +30,7 @@ NAMED = {
     "VRM": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase", "J_Bip_{S}_{limb}", pelvis="J_Bip_C_Hips"),
     "Bandai-Namco": renamed("Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot Toes", "{limb}_{S}"),
     "Xsens": renamed(
-        "Shoulder UpperArm ForeArm Hand UpperLeg LowerLeg Foot Toe",
-        pelvis="Pelvis",
-        spine1="L5",
-        spine2="L3",
-        spine3="T8",
+        "Shoulder UpperArm ForeArm Hand UpperLeg LowerLeg Foot Toe", pelvis="Pelvis", spine1="L5", spine2="L3", spine3="T8"
     ),
     "SOMA": renamed("Shoulder Arm ForeArm Hand Leg Shin Foot ToeBase", neck="Neck1"),
     "Rocketbox": renamed("Clavicle UpperArm Forearm Hand Thigh Calf Foot Toe0", "Bip01 {S} {limb}", pelvis="Bip01 Pelvis"),

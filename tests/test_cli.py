@@ -68,18 +68,7 @@ def test_from_photos_to_images(capture_folder, tmp_path, monkeypatch, humangs):
     monkeypatch.chdir(tmp_path)
     for arguments in (
         ("reconstruct", capture_folder, "--out", "avatar.npz"),
-        (
-            "refine",
-            "avatar.npz",
-            capture_folder,
-            "--limit",
-            "2steps",
-            "--image-size",
-            "64",
-            "--live",
-            "--out",
-            "refined.npz",
-        ),
+        ("refine", "avatar.npz", capture_folder, "--limit", "2steps", "--image-size", "64", "--live", "--out", "refined.npz"),
         ("render", "refined.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
         ("export", "avatar.npz", "--out", "avatar.ply"),
         ("check", capture_folder, "--out", "check.png"),

@@ -60,10 +60,7 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
             hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000_000)
         write = lambda folder: atomic.replace_file("file", lambda file: work(folder, file))
     """
-    program, began = (
-        process(command("atomic.replace_folder('new', write, mark='x')", writing), tmp_path),
-        time.monotonic(),
-    )
+    program, began = (process(command("atomic.replace_folder('new', write, mark='x')", writing), tmp_path), time.monotonic())
     _, error = interrupted(program)
     assert program.returncode == cli.INTERRUPTED and error.endswith("humangs: interrupted\n")
     assert PATIENCE <= time.monotonic() - began < 50

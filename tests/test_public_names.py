@@ -43,9 +43,5 @@ def test_type_checkers_see_functions(tmp_path):
     (tmp_path / "user.py").write_text(USER)
     command = ["ty", "check", "--python", sys.prefix, "--output-format", "concise", "user.py"]
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    for line in (
-        "gaussians: Gaussians, camera: Camera",
-        "Revealed type: `Gaussians`",
-        "Expected `Gaussians`, found `Avatar`",
-    ):
+    for line in ("gaussians: Gaussians, camera: Camera", "Revealed type: `Gaussians`", "Expected `Gaussians`, found `Avatar`"):
         assert line in text, text

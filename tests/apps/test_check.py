@@ -120,10 +120,7 @@ def test_mistakes_that_no_single_view_shows_are_named(tmp_path):
     seen = right.cameras
     exchanged = replace(seen, K=seen.K[order], cam_from_world=seen.cam_from_world[order])
     for changed, named in (
-        (
-            dataclasses.replace(right, cameras=exchanged),
-            "cameras are exchanged: the body would fit 000 by the camera of 001",
-        ),
+        (dataclasses.replace(right, cameras=exchanged), "cameras are exchanged: the body would fit 000 by the camera of 001"),
         (capture(rotations=np.full((1, 3, 3), 30.0)), "the poses seem to be in degrees: rotations up to 52"),
     ):
         report = check_capture(changed, tmp_path / "check.png")
@@ -168,12 +165,7 @@ def test_report_is_a_table():
     report = module.CheckReport((ViewCheck("front", 0.5, 0.01, 0.25, ("too small",)), ViewCheck("left-side", None, None, 1.0)))
     header, front, left, warning = str(report).splitlines()
     assert header.split() == ["view", "silhouette", "IoU", "body", "outside", "mask", "body", "in", "frame"]
-    assert front.split() == ["front", "0.500", "1.0%", "25%", "!"] and left.split() == [
-        "left-side",
-        "no",
-        "mask",
-        "100%",
-    ]
+    assert front.split() == ["front", "0.500", "1.0%", "25%", "!"] and left.split() == ["left-side", "no", "mask", "100%"]
     assert warning == "warning: front: too small" and not report.ok
 
 

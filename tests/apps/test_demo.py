@@ -34,18 +34,7 @@ def video_frames(path):
     """(m, h, w, 3) bytes by ffmpeg itself: imageio's reader leaves file handles open."""
     import imageio_ffmpeg
 
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-i",
-        str(path),
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-",
-    ]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     data = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=True).stdout
     return np.frombuffer(data, np.uint8).reshape(-1, FRAME_SIZE, FRAME_SIZE, 3)
 

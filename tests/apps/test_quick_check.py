@@ -39,10 +39,7 @@ CHANGES = {
         lambda c: {"images": c.images[:, :, ::-1], "masks": c.masks[:, :, ::-1]},
         "if the photo is mirrored: view 0_00, 0_01, 0_02, 0_03",
     ),
-    "one mask is empty": (
-        lambda c: {"masks": np.concatenate([c.masks[:1] * 0, c.masks[1:]])},
-        "the mask is empty: view 0_00",
-    ),
+    "one mask is empty": (lambda c: {"masks": np.concatenate([c.masks[:1] * 0, c.masks[1:]])}, "the mask is empty: view 0_00"),
     "photos are underexposed": (lambda c: {"images": on_white(c, c.images / 16)}, "the person is nearly black"),
     "photos are burnt out": (lambda c: {"images": on_white(c, c.images * 16)}, "most of the person is white"),
     "two cameras are exchanged": (

@@ -107,15 +107,9 @@ def test_what_is_missing_comes_with_its_tools(name, mine, capsys):
         f"humangs: error: photos: {name} missing: make them as above and run the same command again\n"
     )
     tools = {
-        "cameras": (
-            "colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images",
-            "EasyMocap",
-        ),
+        "cameras": ("colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images", "EasyMocap"),
         "masks": ("rembg p -m u2net_human_seg -om photos/images photos/masks", "SAM 2"),
-        "keypoints": (
-            "inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints",
-            "openpose.bin",
-        ),
+        "keypoints": ("inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints", "openpose.bin"),
     }
     for other, lines in tools.items():
         assert all((line in out) == (other == name) for line in lines), out
@@ -294,9 +288,7 @@ def test_several_people_without_cameras_are_refused_with_a_sheet(mine, detected,
     (mine / "calibration.json").unlink()
     found = detect.found_in_capture(Path("me"))
     monkeypatch.setattr(
-        detect,
-        "detect_photos",
-        lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)],
+        detect, "detect_photos", lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)]
     )
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "numbers on me_people.png" in capsys.readouterr().err

@@ -180,11 +180,7 @@ def test_without_masks_nothing_that_refines_is_tried():
         (("tune", "demo_capture"), 2, "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them"),
         (("tune", "demo_capture", "--frame-ms", "-1"), 2, "--frame-ms -1.0: expected a positive number"),
         (("tune", "demo_capture", "--frame-ms", "9", "--out", "tuned.txt"), 2, "expected a name ending in .json"),
-        (
-            ("reconstruct", "demo_capture", "--preset", "best", "--config", "x.json"),
-            2,
-            "does not go with --preset best",
-        ),
+        (("reconstruct", "demo_capture", "--preset", "best", "--config", "x.json"), 2, "does not go with --preset best"),
         (("reconstruct", "demo_capture", "--config", "missing.json"), 1, "missing.json: no such file"),
         (("animate", "a.npz", "--config", "missing.json"), 1, "missing.json: no such file"),
         (("render", "a.npz", "--preset", "best", "--config", "x.json"), 2, "does not go with --preset best"),

@@ -89,10 +89,7 @@ def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
         (unlike(avatar, scales=drawn.scales.at[3, 1].set(jnp.inf)), "scales: expected numbers in"),
         (unlike(avatar, colors=drawn.colors.at[3, 1].set(-3e38)), "colors: expected numbers in"),
         (unlike(avatar, rest_joints=avatar.rest_joints.at[0].set(jnp.inf)), "rest_joints: expected numbers in"),
-        (
-            unlike(avatar, skinning_weights=0 * avatar.skinning_weights),
-            "skinning_weights: expected rows with the sum 1",
-        ),
+        (unlike(avatar, skinning_weights=0 * avatar.skinning_weights), "skinning_weights: expected rows with the sum 1"),
     ):
         with pytest.raises(FileError, match=said) as caught:
             wrong.save(path)
@@ -184,15 +181,9 @@ def test_ply_survives_extremes(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda a, p: (a, replace(p, rotations=p.rotations.at[1, 2].set(jnp.nan))),
-            r"pose\.rotations: .*\[1, 2\]: nan",
-        ),
+        (lambda a, p: (a, replace(p, rotations=p.rotations.at[1, 2].set(jnp.nan))), r"pose\.rotations: .*\[1, 2\]: nan"),
         (lambda a, p: (a, replace(p, translation=p.translation.at[0].set(jnp.inf))), r"pose\.translation"),
-        (
-            lambda a, p: (replace(a, gaussians=replace(a.gaussians, opacities=a.gaussians.opacities + 9)), p),
-            "opacities",
-        ),
+        (lambda a, p: (replace(a, gaussians=replace(a.gaussians, opacities=a.gaussians.opacities + 9)), p), "opacities"),
         (lambda a, p: (a, replace(p, rotations=p.rotations[:1])), "expected one pose of 3 joints"),
         (lambda a, p: (a, jax.tree.map(lambda x: x[None], p)), "use jax.vmap for a batch of poses"),
     ],

@@ -117,17 +117,7 @@ def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
 def test_ctrl_c_in_the_middle_leaves_nothing(out, folder):
     """Frames are written while they are drawn: the signal comes when a temporary file is there."""
     before = sorted(folder.iterdir())
-    command = [
-        sys.executable,
-        "-m",
-        "humangs_jax.cli",
-        "animate",
-        "avatar.npz",
-        "--motion",
-        "motion.npz",
-        "--loop",
-        "500",
-    ]
+    command = [sys.executable, "-m", "humangs_jax.cli", "animate", "avatar.npz", "--motion", "motion.npz", "--loop", "500"]
     process = subprocess.Popen(
         [*command, "--size", "64", "--out", out], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder
     )

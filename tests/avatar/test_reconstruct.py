@@ -138,12 +138,7 @@ def capture(body, height, width, views=2):
     cameras, images = ring(views, 2.2, width, height), np.random.default_rng(0).random((views, height, width, 3))
     pose = np.zeros((1, 55, 3)), np.zeros((1, 3))
     return capture_from_arrays(
-        images,
-        np.asarray(cameras.K),
-        np.asarray(cameras.cam_from_world),
-        *pose,
-        masks=np.ones_like(images[..., 0]),
-        body=body,
+        images, np.asarray(cameras.K), np.asarray(cameras.cam_from_world), *pose, masks=np.ones_like(images[..., 0]), body=body
     )
 
 
@@ -295,10 +290,7 @@ def test_the_size_of_the_photos_is_a_choice_of_execution():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda c: {"poses": replace(c.poses, rotations=c.poses.rotations[:, :24])},
-            r"poses\.rotations: .*got \(1, 24, 3\)",
-        ),
+        (lambda c: {"poses": replace(c.poses, rotations=c.poses.rotations[:, :24])}, r"poses\.rotations: .*got \(1, 24, 3\)"),
         (lambda c: {"poses": c.poses[0]}, r"poses\.rotations: expected shape"),
         (lambda c: {"cameras": c.cameras[0]}, r"cameras\.K: expected shape \(2, 3, 3\), got \(3, 3\)"),
         (lambda c: {"cameras": jax.tree.map(lambda x: x[:1], c.cameras)}, r"cameras\.K: expected shape \(2, 3, 3\)"),
@@ -334,8 +326,7 @@ def test_the_token_capacity_follows_the_photos(body, network):
 
 
 @pytest.mark.parametrize(
-    ("views", "message"),
-    [([], "0 views"), ([0] * 513, r"513 photos in capture: the limit network_views is 512 \(HUMANGS")],
+    ("views", "message"), [([], "0 views"), ([0] * 513, r"513 photos in capture: the limit network_views is 512 \(HUMANGS")]
 )
 def test_no_photos_and_more_than_the_limit_are_an_error(body, network, views, message):
     with pytest.raises(ValueError, match=message):

@@ -72,11 +72,7 @@ def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
     write_video(tmp_path / "frames", moving_square(5), 24)
     (tmp_path / "frames" / "notes.txt").write_text("mine")
     write_video(tmp_path / "frames", moving_square(2), 24)
-    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
-        "frame_00000.png",
-        "frame_00001.png",
-        "notes.txt",
-    ]
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["frame_00000.png", "frame_00001.png", "notes.txt"]
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])

@@ -53,9 +53,7 @@ def test_texture_corners_belong_to_their_vertices_and_stay_in_their_charts(small
     uv_of = {
         (int(v), *uv)
         for v, uv in zip(
-            np.asarray(body.faces).ravel(),
-            np.asarray(body.uvs)[np.asarray(body.uv_faces).ravel()].tolist(),
-            strict=True,
+            np.asarray(body.faces).ravel(), np.asarray(body.uvs)[np.asarray(body.uv_faces).ravel()].tolist(), strict=True
         )
     }
     uvs = np.asarray(small.uvs)[np.asarray(small.uv_faces)]

@@ -105,17 +105,7 @@ def test_left_and_right_are_mirror_images(body):
 
 
 def test_where_the_surface_landmarks_are(body):
-    names = (
-        "nose",
-        "face_27",
-        "face_8",
-        "left_ear",
-        "left_big_toe",
-        "left_small_toe",
-        "left_heel",
-        "left_ankle",
-        "left_eye",
-    )
+    names = ("nose", "face_27", "face_8", "left_ear", "left_big_toe", "left_small_toe", "left_heel", "left_ankle", "left_eye")
     at = dict(zip(names, at_rest(landmark_model(body, names)), strict=True))
     height, depth = 1, 2
     assert at["face_27"][height] > at["nose"][height] > at["face_8"][height]

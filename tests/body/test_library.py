@@ -134,9 +134,7 @@ def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
     nose = int(np.argmax(_face_front(body)))
     assert turned.vertices[nose, 0] > 0.04  # towards the person's left
     assert np.allclose(
-        turned.vertices[np.asarray(body.template)[:, 1] < 0],
-        body.template[np.asarray(body.template)[:, 1] < 0],
-        atol=1e-5,
+        turned.vertices[np.asarray(body.template)[:, 1] < 0], body.template[np.asarray(body.template)[:, 1] < 0], atol=1e-5
     )
 
 

@@ -127,11 +127,7 @@ def test_current_files_hold_expressions_after_300_columns(tmp_path):
     np.savez(tmp_path / "model.npz", **{k: v % 2 if k == "f" else v for k, v in arrays.items()})
     body = load_body(tmp_path / "model.npz", shape_count=1, expression_count=1)
     assert np.allclose(body.shape_directions, arrays["shapedirs"][..., [0, 300]], atol=ATOL)
-    assert load_smplx(tmp_path / "model.npz", shape_count=300, expression_count=100).shape_directions.shape == (
-        2,
-        3,
-        400,
-    )
+    assert load_smplx(tmp_path / "model.npz", shape_count=300, expression_count=100).shape_directions.shape == (2, 3, 400)
     with pytest.raises(ValueError, match="shapedirs: has 300 shape directions, asked for 301"):
         load_smplx(tmp_path / "model.npz", shape_count=301)
 

@@ -26,13 +26,7 @@ GAUSSIANS = hg.Gaussians(jnp.zeros((COUNT, 3)), jnp.ones((COUNT, 4)), jnp.ones((
 CAMERA = hg.Camera(jnp.eye(3), jnp.eye(4), 8, 8)
 POSE = hg.BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
 AVATAR = hg.Avatar(
-    GAUSSIANS,
-    jnp.ones((COUNT, 2)) / 2,
-    jnp.zeros((4, 3)),
-    jnp.zeros((2, 3)),
-    jnp.zeros((1, 3), int),
-    (-1, 0),
-    ("a", "b"),
+    GAUSSIANS, jnp.ones((COUNT, 2)) / 2, jnp.zeros((4, 3)), jnp.zeros((2, 3)), jnp.zeros((1, 3), int), (-1, 0), ("a", "b")
 )
 AVATARS = jax.tree.map(lambda x: jnp.stack([x, x]), AVATAR)
 CAPTURE = hg.capture_from_arrays(
@@ -50,26 +44,17 @@ WRONG = {
     "avatar for Gaussians": (lambda: hg.render(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar; animate"),
     "the same in jit": (lambda: jax.jit(hg.render)(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
     "the other order": (lambda: hg.render(CAMERA, GAUSSIANS), "gaussians: expected Gaussians, got Camera"),
-    "a capture for a camera": (
-        lambda: hg.render(GAUSSIANS, CAPTURE),
-        "camera: expected Camera, got Capture; it has a batch",
-    ),
+    "a capture for a camera": (lambda: hg.render(GAUSSIANS, CAPTURE), "camera: expected Camera, got Capture; it has a batch"),
     "nothing": (lambda: hg.render(GAUSSIANS, None), "camera: expected Camera, got None"),
     "a class": (lambda: hg.render(GAUSSIANS, hg.Camera), "camera: expected Camera, got the class Camera"),
     "too few": (lambda: hg.render(GAUSSIANS), r"render\(gaussians, camera, ...\): missing .* 'camera'"),
     "no preset": (lambda: hg.render(GAUSSIANS, CAMERA, "fst"), "no preset 'fst': expected one of exact, near_exact"),
-    "a field": (
-        lambda: hg.render(GAUSSIANS, CAMERA, tile_size=4),
-        r"it is a field of SplatConfig, config=SplatConfig\(tile",
-    ),
+    "a field": (lambda: hg.render(GAUSSIANS, CAMERA, tile_size=4), r"it is a field of SplatConfig, config=SplatConfig\(tile"),
     "a field of refinement": (
         lambda: hg.refine(AVATAR, CAPTURE, iterations=10),
         r"^refine\(avatar, capture, ...\): no argument 'iterations': it is a field of RefineConfig, config=RefineConfig",
     ),
-    "an unknown name": (
-        lambda: hg.render(GAUSSIANS, CAMERA, color=1),
-        "no argument 'color'; its arguments are gaussians, ",
-    ),
+    "an unknown name": (lambda: hg.render(GAUSSIANS, CAMERA, color=1), "no argument 'color'; its arguments are gaussians, "),
     "reference": (lambda: hg.render_reference(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
     "buffers": (lambda: hg.plan_buffers(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
     "order of reconstruct": (
@@ -84,46 +69,22 @@ WRONG = {
     "order of init": (lambda: hg.init_humangs(CONFIG, jax.random.key(0)), "config: expected HumanGSConfig, got "),
     "order of skin": (lambda: hg.skin(POSE, AVATAR), "avatar: expected Avatar, got BodyPose"),
     "a capture for a pose": (lambda: hg.animate(AVATAR, CAPTURE), "pose: expected BodyPose, got Capture; capture.pose"),
-    "a name of no preset": (
-        lambda: hg.reconstruct_with("real", {}, CONFIG, CAPTURE),
-        "settings 'real': expected Settings or",
-    ),
+    "a name of no preset": (lambda: hg.reconstruct_with("real", {}, CONFIG, CAPTURE), "settings 'real': expected Settings or"),
     "an image": (lambda: hg.show(IMAGE), "avatar: expected Avatar, got ndarray"),
     "no path": (lambda: write_ply(GAUSSIANS, "a.ply"), "path: expected str or PathLike, got Gaussians"),
-    "a batch of avatars": (
-        lambda: hg.animate(AVATARS, POSE),
-        r"avatar: expected one Avatar, got a batch \(2,\): take one",
-    ),
-    "a training of a network": (
-        lambda: hg.train(CONFIG, None, [], "x"),
-        "config: expected TrainConfig, got HumanGSConfig",
-    ),
-    "fewer colors": (
-        lambda: hg.render(cut("colors", 3), CAMERA),
-        r"gaussians.colors: expected shape \(7, 3\), got \(3, 3\)",
-    ),
-    "fewer opacities": (
-        lambda: hg.render(cut("opacities", 3), CAMERA),
-        r"opacities: expected shape \(7,\), got \(3,\)",
-    ),
+    "a batch of avatars": (lambda: hg.animate(AVATARS, POSE), r"avatar: expected one Avatar, got a batch \(2,\): take one"),
+    "a training of a network": (lambda: hg.train(CONFIG, None, [], "x"), "config: expected TrainConfig, got HumanGSConfig"),
+    "fewer colors": (lambda: hg.render(cut("colors", 3), CAMERA), r"gaussians.colors: expected shape \(7, 3\), got \(3, 3\)"),
+    "fewer opacities": (lambda: hg.render(cut("opacities", 3), CAMERA), r"opacities: expected shape \(7,\), got \(3,\)"),
     "fewer in jit": (lambda: jax.jit(hg.render)(cut("scales", 3), CAMERA), r"scales: expected shape \(7, 3\)"),
-    "no intrinsics": (
-        lambda: hg.render(GAUSSIANS, replace(CAMERA, K=jnp.eye(4))),
-        r"camera.K: expected shape \(3, 3\)",
-    ),
+    "no intrinsics": (lambda: hg.render(GAUSSIANS, replace(CAMERA, K=jnp.eye(4))), r"camera.K: expected shape \(3, 3\)"),
     "weights of others": (
         lambda: hg.skin(replace(AVATAR, skinning_weights=jnp.ones((COUNT, 5))), POSE),
         r"avatar.rest_joints: expected shape \(5, 3\), got \(2, 3\)",
     ),
     "a color": (lambda: hg.render(GAUSSIANS, CAMERA, background="blak"), "background 'blak': expected a color"),
-    "two numbers": (
-        lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0)),
-        r"background: expected 3 numbers .* got \(0, 0\)",
-    ),
-    "bytes": (
-        lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0, 255)),
-        r"background: expected 3 numbers in \[0, 1\]",
-    ),
+    "two numbers": (lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0)), r"background: expected 3 numbers .* got \(0, 0\)"),
+    "bytes": (lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0, 255)), r"background: expected 3 numbers in \[0, 1\]"),
     "degrees": (lambda: intrinsics_from_fov(40.0, 8, 8), r"vertical_fov 40: expected radians .*np.deg2rad\(40\)"),
     "degrees of an orbit": (
         lambda: hg.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 30.0, jnp.eye(3), 8, 8),
@@ -141,10 +102,7 @@ WRONG = {
         lambda: shape_body(load_body(), jnp.zeros((2, 3))),
         r"betas: expected an array of shape \(s_used\), got \(2, 3\)",
     ),
-    "a number for people": (
-        lambda: hg.evaluate(3),
-        r"^evaluate\(source, ...\): source: expected str or .* or Iterable, got int",
-    ),
+    "a number for people": (lambda: hg.evaluate(3), r"^evaluate\(source, ...\): source: expected str or .* or Iterable, got int"),
     "names for people": (lambda: hg.evaluate(iter([3])), "source: expected Cases, got a int among them"),
     "as_trained": (lambda: hg.SPLAT_PRESETS["as_trained"], "no preset 'as_trained': .*SPLAT_PRESETS.avatar.rendering"),
     "of training": (lambda: hg.PRESETS["tiny"], "no preset 'tiny': expected one of realtime, .*training.config"),
@@ -168,11 +126,7 @@ def test_wrong_arguments_are_named(name):
         (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
         (hg.SplatConfig(), {"matmul_precision": "float16"}, "matmul_precision: expected one of 'float32', 'bfloat16'"),
         (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),
-        (
-            CONFIG.conventions,
-            {"tokens": "front"},
-            "Conventions: tokens: expected one of 'all', 'foreground', got 'front'",
-        ),
+        (CONFIG.conventions, {"tokens": "front"}, "Conventions: tokens: expected one of 'all', 'foreground', got 'front'"),
         (CONFIG, {"runtime": "fast"}, "HumanGSConfig: runtime: expected Runtime, got 'fast'"),
     ],
 )
@@ -259,11 +213,7 @@ def test_what_is_right_passes():
 @pytest.mark.parametrize(
     ("entries", "values", "words"),
     [
-        (
-            [[0, 1], [np.nan, np.inf]],
-            FINITE,
-            r"expected finite numbers, but 2 of 4 are not, the first at \[1, 0\]: nan",
-        ),
+        ([[0, 1], [np.nan, np.inf]], FINITE, r"expected finite numbers, but 2 of 4 are not, the first at \[1, 0\]: nan"),
         ([0, 1, -np.inf], NOT_NEGATIVE, r"expected finite numbers >= 0, but 1 of 3 are not, the first at \[2\]: -inf"),
         ([0.5, 1.25, -1], UNIT, r"expected numbers in \[0, 1\], but 2 of 3 are not, the first at \[1\]: 1.25"),
         ([1, 0], POSITIVE, r"expected finite numbers > 0, but 1 of 2 are not, the first at \[1\]: 0"),

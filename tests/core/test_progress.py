@@ -113,11 +113,7 @@ def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
 
 def test_tables_are_aligned_and_rows_may_end_early():
     rows = [["view", "error", "share"], ["a long name", "1.0 px", "7%", "!"], ["b", "-"]]
-    assert progress.text_table(rows) == [
-        "view          error  share",
-        "a long name  1.0 px     7%  !",
-        "b                 -",
-    ]
+    assert progress.text_table(rows) == ["view          error  share", "a long name  1.0 px     7%  !", "b                 -"]
     assert progress.text_table([["a", "b"], ["cc", "d"]], left=2) == ["a   b", "cc  d"]
 
 

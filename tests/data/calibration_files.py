@@ -72,10 +72,7 @@ def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, 
         values = " ".join(repr(float(x)) for x in [*focal, k[0, 2], k[1, 2], *extra])
         lines.append(f"{i} {model} {WIDTH} {HEIGHT} {values}")
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
-    lines = [
-        "# Image list with two lines of data per image:",
-        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
-    ]
+    lines = ["# Image list with two lines of data per image:", "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
     for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
         values = " ".join(repr(float(x)) for x in [*quaternion(pose[:3, :3]), *pose[:3, 3]])
         lines.append(f"{i + 10} {values} {i + 1} {name}")
@@ -134,13 +131,7 @@ def write_opencv_yaml(file, K, poses, names):
 
 def write_opencv_json(file, K, poses, names):
     """As cv2.FileStorage writes JSON."""
-    entry = lambda m: {
-        "type_id": "opencv-matrix",
-        "rows": len(m),
-        "cols": m.shape[1],
-        "dt": "d",
-        "data": m.ravel().tolist(),
-    }
+    entry = lambda m: {"type_id": "opencv-matrix", "rows": len(m), "cols": m.shape[1], "dt": "d", "data": m.ravel().tolist()}
     values = {"names": list(names)}
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
         values |= {f"K_{name}": entry(k), f"R_{name}": entry(pose[:3, :3]), f"T_{name}": entry(pose[:3, 3:])}

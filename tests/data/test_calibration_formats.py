@@ -267,24 +267,12 @@ def colmap(tmp_path, cameras=None, images=None):
 @pytest.mark.parametrize(
     ("cameras", "images", "problem"),
     [
-        (
-            lambda t: t.replace("PINHOLE", "OPENCV_FISHEYE"),
-            None,
-            "line 2: camera model OPENCV_FISHEYE: expected one of",
-        ),
-        (
-            lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"),
-            None,
-            "line 2: SIMPLE_PINHOLE: expected WIDTH HEIGHT f cx cy",
-        ),
+        (lambda t: t.replace("PINHOLE", "OPENCV_FISHEYE"), None, "line 2: camera model OPENCV_FISHEYE: expected one of"),
+        (lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"), None, "line 2: SIMPLE_PINHOLE: expected WIDTH HEIGHT f cx cy"),
         (lambda t: t.replace("64 48", "64 x"), None, "line 2: could not convert"),
         (lambda t: t[: t.index("\n2 ")], None, "line 5: camera 2 is not in cameras.txt"),
         (None, lambda t: "# nothing\n", "images.txt: no image is registered"),
-        (
-            None,
-            lambda t: "\n".join(line for line in t.split("\n") if line),
-            "line 4: expected X Y POINT3D_ID of each point",
-        ),
+        (None, lambda t: "\n".join(line for line in t.split("\n") if line), "line 4: expected X Y POINT3D_ID of each point"),
         (None, lambda t: t.replace("a.png", ""), "line 3: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"),
         (None, lambda t: t.replace("b.png", "z.png"), r"images\.txt: z\.png: no such photo \(PNG or JPEG\)"),
         (None, lambda t: t.replace("b.png", "sub/a.png"), r"a\.png is the photo of a\.png already"),
@@ -304,14 +292,8 @@ def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, probl
         (lambda v: v["frames"][1].pop("transform_matrix"), r"frames\[1\]\.transform_matrix: missing"),
         (lambda v: v["frames"][1].pop("file_path"), r"frames\[1\]\.file_path: missing"),
         (lambda v: v["frames"][1].update(file_path="z"), r"transforms\.json: z: no such photo"),
-        (
-            lambda v: [f.pop("fl_x") and f.pop("fl_y") for f in v["frames"]],
-            r"frames\[0\]\.fl_x: missing: expected fl_x or",
-        ),
-        (
-            lambda v: v["frames"][1].update(transform_matrix=[[0.0] * 4] * 4),
-            r"frames\[1\]\.transform_matrix: .*singular",
-        ),
+        (lambda v: [f.pop("fl_x") and f.pop("fl_y") for f in v["frames"]], r"frames\[0\]\.fl_x: missing: expected fl_x or"),
+        (lambda v: v["frames"][1].update(transform_matrix=[[0.0] * 4] * 4), r"frames\[1\]\.transform_matrix: .*singular"),
         (lambda v: v.update(camera_model="OPENCV_FISHEYE"), "camera_model: 'OPENCV_FISHEYE': expected"),
         (lambda v: v.update(is_fisheye=True), "is_fisheye: fisheye lenses"),
         (lambda v: v.update(k4=0.1), "k4: expected 0"),
@@ -373,10 +355,7 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
     ("keys", "problem"),
     [
         ([{"camera_index": i % 3} for i in ALL], r"frames\[0\] and frames\[3\] have the camera_index 0, so they show"),
-        (
-            [{"camera_id": f"c{i % 2}"} for i in ALL],
-            r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest",
-        ),
+        ([{"camera_id": f"c{i % 2}"} for i in ALL], r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest"),
         ([{}] * 6, r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments"),
         ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing, but other frames have it"),
         ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number or a name, got None"),

@@ -264,10 +264,7 @@ def with_value(key, value):
         (with_value("K", [1, 2, 3]), r"b\.K: expected 3 x 3 numbers"),
         (with_value("K", "nine"), r"b\.K: expected numbers"),
         (with_value("T", [0, 0, float("nan")]), r"b\.T: expected finite numbers"),
-        (
-            with_value("R", [2, 0, 0, 0, 2, 0, 0, 0, 2]),
-            "b: cam_from_world: the rotation is singular, mirrored or scaled",
-        ),
+        (with_value("R", [2, 0, 0, 0, 2, 0, 0, 0, 2]), "b: cam_from_world: the rotation is singular, mirrored or scaled"),
         (with_value("K", [70, 5, 32, 0, 70, 24, 0, 0, 1]), r"b: K: expected \[\[fx, 0, cx\]"),
         (with_value("distCoeff", [0.1, 0, 0]), r"b\.distCoeff: expected k1 k2 p1 p2 \[k3\], got 3"),
         (with_value("distCoeff", [[0.1, 0], [0]]), r"b\.distCoeff: expected numbers"),
@@ -391,10 +388,7 @@ def test_masks_that_are_likely_wrong_are_named(rig, tmp_path, mask, warning):
     ("mask", "problem"),
     [
         (PERSON // 255, r"masks/a\.png: values: the largest is 1 of 255: expected 0 \(background\) to 255"),
-        (
-            PERSON // 255 * (1 + np.arange(written.WIDTH) % 18).astype(np.uint8),
-            r"a\.png: values: the largest is 18 of 255",
-        ),
+        (PERSON // 255 * (1 + np.arange(written.WIDTH) % 18).astype(np.uint8), r"a\.png: values: the largest is 18 of 255"),
         (PERSON // 2, r"a\.png: values: the largest is 127 of 255"),
         ((PERSON > 0).astype(np.uint16) * 255, r"a\.png: values: the largest is 0.992 of 255"),
         (np.dstack([PERSON, np.roll(PERSON, 4, axis=0), 0 * PERSON]), r"a\.png: 3 colors: which is the person\?"),

@@ -22,12 +22,7 @@ def tables(title, name="", extra=""):
     """TOML: a table of each camera."""
     lines = ["[metadata]", "adjusted = true"]
     for i, (k, pose) in enumerate(zip(K, POSES, strict=True)):
-        lines += [
-            f"[{title.format(i)}]",
-            *([f'name = "{name.format(NAMES[i])}"'] if name else []),
-            f"size = {SIZE}",
-            extra,
-        ]
+        lines += [f"[{title.format(i)}]", *([f'name = "{name.format(NAMES[i])}"'] if name else []), f"size = {SIZE}", extra]
         lines += [f"matrix = {k.tolist()}", f"distortions = {LENS}", f"translation = {pose[:3, 3].tolist()}"]
         lines += [f"rotation = {Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()}"]
     return "\n".join(lines)
@@ -35,13 +30,7 @@ def tables(title, name="", extra=""):
 
 def panoptic():
     rows = zip(NAMES, K, POSES, strict=True)
-    entry = lambda n, k, p: {
-        "name": n,
-        "K": k.tolist(),
-        "R": p[:3, :3].tolist(),
-        "t": p[:3, 3:].tolist(),
-        "distCoef": LENS,
-    }
+    entry = lambda n, k, p: {"name": n, "K": k.tolist(), "R": p[:3, :3].tolist(), "t": p[:3, 3:].tolist(), "distCoef": LENS}
     return {"cameras": [entry(*row) | {"resolution": SIZE, "type": "hd"} for row in rows]}
 
 
@@ -65,11 +54,7 @@ def qualisys():
         moved = (k[0, 0], k[1, 1], k[0, 2] + 3, k[1, 2] + 2)
         keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
         inner = " ".join(f'{key}="{64 * value!r}"' for key, value in zip(keys, map(float, moved), strict=True))
-        lens = zip(
-            ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2"),
-            LENS,
-            strict=False,
-        )
+        lens = zip(("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2"), LENS, strict=False)
         inner += " " + " ".join(f'{key}="{value}"' for key, value in lens)
         at = " ".join(f'{axis}="{float(v)!r}"' for axis, v in zip("xyz", place, strict=True))
         view = f'<fov_video left="3" top="2" right="{2 + SIZE[0]}" bottom="{1 + SIZE[1]}"/>'

@@ -222,11 +222,7 @@ NOT_FINITE = [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]
 BAD = {
     "no capture.json": (lambda f: (f / "capture.json").unlink(), "capture.json", "no such file"),
     "invalid JSON": (lambda f: (f / "capture.json").write_text('{"a": 1,\n"b" 2}'), "capture.json", "line 2"),
-    "binary JSON": (
-        lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"),
-        "capture.json",
-        "not a readable text file",
-    ),
+    "binary JSON": (lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"), "capture.json", "not a readable text file"),
     "a JSON list": (lambda f: (f / "capture.json").write_text("[]"), "capture.json", "expected a JSON object"),
     "format": (top(format="colmap"), "capture.json: format", "colmap"),
     "version": (top(version=2), "capture.json: version", "expected 1"),
@@ -366,12 +362,7 @@ KINDS = {
 """Names of the body's directions, betas, their names, what they mean in the order of the body."""
 WRONG_KINDS = {
     "SMPL-X's shape on expressions": (SMPLX_NAMES, [1, 1, 1], None, "betas: 3 coefficients, but body 'tiny' has 2"),
-    "SMPL-X's shape for another body": (
-        OWN_NAMES,
-        [1, 1],
-        None,
-        "betas: 'shape_0' is no shape direction of body 'tiny'",
-    ),
+    "SMPL-X's shape for another body": (OWN_NAMES, [1, 1], None, "betas: 'shape_0' is no shape direction of body 'tiny'"),
     "another body's": (SMPLX_NAMES, [1, 1], ["age", "sex"], "betas: 'age' is no shape direction"),
     "a name too few": (OWN_NAMES, [1, 1], ["age"], "shape_names: expected 2 different names"),
     "a name twice": (OWN_NAMES, [1, 1], ["age", "age"], "shape_names: expected 2 different names"),

@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.exposure import (
-    EXPECTED,
-    camera_gains,
-    equal_exposure,
-    exposures,
-    gains_of,
-    multiplied,
-    with_gains,
-)
+from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, exposures, gains_of, multiplied, with_gains
 
 SHRINKING = 0.1
 """Share of a gain that the prior keeps back where many points are shared."""

@@ -111,11 +111,7 @@ def test_people_whose_hands_and_faces_were_not_found_are_people(tmp_path, count,
 
 def test_openpose_people_without_hands_are_people(tmp_path):
     body = np.stack([100.0 + np.arange(25), np.full(25, 50.0), np.full(25, 0.8)], axis=1)
-    person = {
-        "pose_keypoints_2d": body.reshape(-1).tolist(),
-        "hand_left_keypoints_2d": [],
-        "hand_right_keypoints_2d": [],
-    }
+    person = {"pose_keypoints_2d": body.reshape(-1).tolist(), "hand_left_keypoints_2d": [], "hand_right_keypoints_2d": []}
     with pytest.raises(CaptureError, match=r"view front: 2 people: expected one"):
         read(tmp_path / "front_keypoints.json", {"people": [person, person]})
     assert read(tmp_path / "front_keypoints.json", {"people": [person]}).missing == ("back",)
@@ -173,16 +169,10 @@ FAULTS = {
     "other photos": ([entry(shift=9000)], r"no point has a confidence above 0 \(not finite: 0, far outside .* 17\)"),
     "same image twice": ([entry("front.jpg"), entry("front.png")], r"'front\.jpg' and 'front\.png' are both for view"),
     "size": (annotations((640, 480)), r"size of front\.png: 640 x 480, but the capture's photos have 320 x 240"),
-    "unknown image": (
-        annotations(image_id=4),
-        r"annotations\[0\]\.image_id: expected the id of one of the images, got 4",
-    ),
+    "unknown image": (annotations(image_id=4), r"annotations\[0\]\.image_id: expected the id of one of the images, got 4"),
     "visibility": (annotations(keypoints=[9.0, 9.0, 3.0] * 17), r"expected visibilities 0, 1 or 2, got 3"),
     "no images": ({"annotations": []}, r"images: missing"),
-    "scores": (
-        [{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}],
-        r"keypoint_scores: expected one for each of 17",
-    ),
+    "scores": ([{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}], r"keypoint_scores: expected one for each of 17"),
     "flat instance": ([{"keypoints": [1.0] * 34, "keypoint_scores": [1.0] * 17}], r"expected x and y of each point"),
     "frame": ([{"frame_id": "a", "instances": []}], r"\[0\]\.frame_id: expected an integer, got 'a'"),
     "no instances": ([{"frame_id": 0}], r"\[0\]\.instances: missing"),
@@ -229,12 +219,7 @@ def test_a_folder_of_two_tools_is_refused(tmp_path):
         read_keypoints(tmp_path, NAMES, *SIZE)
 
 
-OWN = {
-    "points": np.ones((2, 17, 2)),
-    "confidences": np.ones((2, 17)),
-    "set": np.array("coco17"),
-    "names": np.array(NAMES),
-}
+OWN = {"points": np.ones((2, 17, 2)), "confidences": np.ones((2, 17)), "set": np.array("coco17"), "names": np.array(NAMES)}
 
 
 @pytest.mark.parametrize(

@@ -66,11 +66,7 @@ def openpose(*people):
 def annots(values, filename, number=0):
     """As EasyMocap writes them; hands beside BODY_25."""
     hands = {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()} if len(values) == 67 else {}
-    person = {
-        "bbox": [0, 0, 9, 9, 1.0],
-        "personID": number,
-        "keypoints": values[: 25 if hands else None].tolist(),
-    } | hands
+    person = {"bbox": [0, 0, 9, 9, 1.0], "personID": number, "keypoints": values[: 25 if hands else None].tolist()} | hands
     return {"height": SIZE[1], "width": SIZE[0], "annots": [person]} | ({"filename": filename} if filename else {})
 
 
@@ -91,11 +87,7 @@ OF_NAMES = lambda values: zip(NAMES, values, strict=True)
 OF_CAMERAS = lambda values: ((i // 2, i % 2, each) for i, each in enumerate(values))
 VIDEO = ("f_0000", "f_0001", "f_0002")
 FOLDERS = {
-    "OpenPose": (
-        OPENPOSE_67,
-        NAMES,
-        lambda v: {f"{n}_keypoints": openpose(openpose_person(x)) for n, x in OF_NAMES(v)},
-    ),
+    "OpenPose": (OPENPOSE_67, NAMES, lambda v: {f"{n}_keypoints": openpose(openpose_person(x)) for n, x in OF_NAMES(v)}),
     "OpenPose with faces": (
         OPENPOSE_67,
         NAMES,
@@ -237,10 +229,7 @@ def test_annotations_tell_visibility(tmp_path, whole):
 def test_fractional_visibilities_are_reliable(tmp_path):
     values = known(17, 1)
     values[..., 2] = 0.25
-    content = {
-        "images": [{"id": 1, "width": 0, "height": 0}],
-        "annotations": [{"image_id": 1, "keypoints": flat(values)}],
-    }
+    content = {"images": [{"id": 1, "width": 0, "height": 0}], "annotations": [{"image_id": 1, "keypoints": flat(values)}]}
     keypoints = read(write(tmp_path / "a.json", content), ("1",))
     np.testing.assert_array_equal(keypoints.confidences, 1)
 

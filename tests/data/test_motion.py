@@ -249,10 +249,7 @@ BAD = {
     ),
     "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one number"),
     "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
-    "beyond float32": (
-        {**AMASS, "poses": np.full((FRAMES, 165), 1e300)},
-        ": poses: expected finite numbers, got 1e+300",
-    ),
+    "beyond float32": ({**AMASS, "poses": np.full((FRAMES, 165), 1e300)}, ": poses: expected finite numbers, got 1e+300"),
     "infinite": ({**AMASS, "trans": np.full((FRAMES, 3), np.inf)}, ": trans: expected finite"),
     "counts": ({**AMASS, "trans": np.zeros((FRAMES + 1, 3))}, ": trans: expected shape (6, 3), got (7, 3)"),
     "no trans": (without(AMASS, "trans"), ": trans: missing"),

@@ -135,11 +135,7 @@ def wham(rotations=ROTATIONS, places=PLACES, **more):
 def gvhmr():
     camera = parts(*down(ROTATIONS, PLACES + 1))
     body = lambda values: {key: value for key, value in values.items() if "hand" not in key and "jaw" not in key}
-    return {
-        "smpl_params_incam": body(camera),
-        "smpl_params_global": body(parts()),
-        "net_outputs": {"x": np.zeros((2, 2))},
-    }
+    return {"smpl_params_incam": body(camera), "smpl_params_global": body(parts()), "net_outputs": {"x": np.zeros((2, 2))}}
 
 
 def prompthmr():
@@ -158,11 +154,7 @@ def phalp(track=3):
         own = {"global_orient": camera["global_orient"][i], "body_pose": camera["body_pose"][i], "betas": np.zeros(10)}
         seen = [(track, own, camera["transl"][i])]
         if i < 2:
-            two = {
-                "global_orient": other["global_orient"][i],
-                "body_pose": other["body_pose"][i],
-                "betas": np.zeros(10),
-            }
+            two = {"global_orient": other["global_orient"][i], "body_pose": other["body_pose"][i], "betas": np.zeros(10)}
             seen.insert(0, (track + 4, two, AWAY[i]))
         tid, pose, place = map(list, zip(*seen, strict=True))
         frames[f"_DEMO/{i:06d}.jpg"] = {
@@ -207,14 +199,7 @@ def human3r(people=((4, ROTATIONS, PLACES),)):
         rotvec, transl = map(np.stack, zip(*rows, strict=True))
         ids = np.asarray([number for number, _, _ in people])
         files.append(
-            npz(
-                f"{i:06d}.npz",
-                rotvec=rotvec,
-                transl=transl,
-                smpl_id=ids,
-                cam2world=camera,
-                shape=np.zeros((len(people), 10)),
-            )
+            npz(f"{i:06d}.npz", rotvec=rotvec, transl=transl, smpl_id=ids, cam2world=camera, shape=np.zeros((len(people), 10)))
         )
     return all_of(*(in_folder("smpl", file) for file in files))
 
@@ -226,10 +211,7 @@ def tram(camera=True):
     own = world.copy()
     own[:, 0] = (turns.inv() * Rotation.from_rotvec(world[:, 0])).as_rotvec()
     pelvis = turns.inv().apply(places + PELVIS - at)
-    values = {
-        "pred_rotmat": matrices(np.pad(own[:, :22], ((0, 0), (0, 2), (0, 0)))),
-        "pred_shape": np.zeros((FRAMES, 10)),
-    }
+    values = {"pred_rotmat": matrices(np.pad(own[:, :22], ((0, 0), (0, 2), (0, 0)))), "pred_shape": np.zeros((FRAMES, 10))}
     values |= {"pred_trans": (pelvis - PELVIS)[:, None], "frame": np.arange(FRAMES)}
     cameras = {"pred_cam_R": turns.as_matrix(), "pred_cam_T": at, "img_focal": np.float64(900)}
     files = [in_folder("hps", objects("hps_track_0.npy", values)), objects("camera.npy", cameras)]
@@ -245,11 +227,7 @@ def smplerx(rotations=ROTATIONS, places=PLACES, number=0):
 def slahmr(people):
     stacked = [np.stack(x) for x in zip(*((r[:, 0], r[:, 1:22].reshape(len(r), -1), p) for r, p in people), strict=True)]
     return npz(
-        "a_world_results.npz",
-        root_orient=stacked[0],
-        pose_body=stacked[1],
-        trans=stacked[2],
-        latent_pose=np.zeros((2, 9)),
+        "a_world_results.npz", root_orient=stacked[0], pose_body=stacked[1], trans=stacked[2], latent_pose=np.zeros((2, 9))
     )
 
 
@@ -267,38 +245,22 @@ FILES = {
         {"up": "y"},
     ),
     "SMPL, joints": (npz(poses=np.pad(ROTATIONS[:, :22], ((0, 0), (0, 2), (0, 0))), **AMASS), BODY, {"up": "y"}),
-    "SMPL, a pose": (
-        saved("a.pkl", {"pose": np.pad(FLAT[:, :66], ((0, 0), (0, 6))), "transl": PLACES}),
-        BODY,
-        {"fps": 30},
-    ),
+    "SMPL, a pose": (saved("a.pkl", {"pose": np.pad(FLAT[:, :66], ((0, 0), (0, 6))), "transl": PLACES}), BODY, {"fps": 30}),
     "SMPL-X, fullpose": (npz(fullpose=ROTATIONS, trans=PLACES), EVERY, {"fps": 30, "up": "y"}),
     "AIST++, scaled": (
         npz(smpl_poses=FLAT[:, :66], smpl_trans=93.77 * PLACES, smpl_scaling=np.array([93.77])),
         *(BODY, {"fps": 30}),
     ),
     "AMASS, matrices": (npz(poses=matrices(ROTATIONS).reshape(FRAMES, -1), **AMASS), EVERY, {"up": "y"}),
-    "AIST++": (
-        saved("a.pkl", {"smpl_poses": np.pad(FLAT[:, :66], ((0, 0), (0, 6))), "smpl_trans": 1000 * PLACES}),
-        BODY,
-        {},
-    ),
+    "AIST++": (saved("a.pkl", {"smpl_poses": np.pad(FLAT[:, :66], ((0, 0), (0, 6))), "smpl_trans": 1000 * PLACES}), BODY, {}),
     "parts": (npz(**parts()), [*WITH_FACE, *range(25, 55)], {}),
     "parts of matrices": (npz(**parts(shape=matrices)), [*WITH_FACE, *range(25, 55)], {}),
     "4D-Humans, matrices": (npz(**smpl()), BODY, {}),
-    "no positions": (
-        npz(**{k: v for k, v in parts().items() if k != "transl"}),
-        [*WITH_FACE, *range(25, 55)],
-        {"places": False},
-    ),
+    "no positions": (npz(**{k: v for k, v in parts().items() if k != "transl"}), [*WITH_FACE, *range(25, 55)], {"places": False}),
     "GVHMR": (torch(write_checkpoint, gvhmr()), BODY, {}),
     "GVHMR, older torch": (torch(write_stream, gvhmr()), BODY, {}),
     "GVHMR, pickled": (saved("a.pkl", gvhmr()), BODY, {}),
-    "GVHMR, the camera alone": (
-        saved("a.pkl", {"smpl_params_incam": parts(*down(ROTATIONS, PLACES))}),
-        [*WITH_FACE, *HANDS],
-        {},
-    ),
+    "GVHMR, the camera alone": (saved("a.pkl", {"smpl_params_incam": parts(*down(ROTATIONS, PLACES))}), [*WITH_FACE, *HANDS], {}),
     "WHAM": (saved("wham_output.pkl", collections.defaultdict(dict, {0: wham()}), joblib), BODY, {}),
     "WHAM, padded": (saved("wham_output.pkl", {np.int64(0): wham()}, lambda x: joblib(x, 16)), BODY, {}),
     "WHAM, compressed": (saved("a.pkl", {0: wham()}, lambda x: zlib.compress(joblib(x, protocol=2))), BODY, {}),
@@ -318,11 +280,7 @@ FILES = {
         all_of(in_folder("smpl", texts([f"{i:06d}.json" for i in range(FRAMES)], [{"annots": [x]} for x in easymocap()]))),
         *(BODY, {}),
     ),
-    "EasyMocap, own root": (
-        texts([f"{i}.json" for i in range(FRAMES)], [[x] for x in easymocap(root=[0.4, 0.2, 0])]),
-        BODY,
-        {},
-    ),
+    "EasyMocap, own root": (texts([f"{i}.json" for i in range(FRAMES)], [[x] for x in easymocap(root=[0.4, 0.2, 0])]), BODY, {}),
     "Human3R": (human3r(), [*WITH_FACE, *range(25, 55)], {"fps": 30}),
     "TRAM": (tram(), BODY, {}),
     "TRAM, one track": (lambda folder: tram()(folder) / "hps" / "hps_track_0.npy", BODY, {}),
@@ -370,11 +328,7 @@ def mhr(rots=True, frames=FRAMES):
     for joint, (name, _) in JOINTS.items():
         j = JOINT_NAMES.index(name if name != "spine0" else "pelvis")
         points[:, joint], turns[:, joint] = places[:, j] - at, world[:, j] @ own[joint]
-    found = {
-        "pred_joint_coords": points,
-        "pred_cam_t": np.tile(at, (FRAMES, 1)),
-        "pred_vertices": np.zeros((FRAMES, 4, 3)),
-    }
+    found = {"pred_joint_coords": points, "pred_cam_t": np.tile(at, (FRAMES, 1)), "pred_vertices": np.zeros((FRAMES, 4, 3))}
     return found | ({"pred_global_rots": turns} if rots else {})
 
 

@@ -280,18 +280,7 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
 
 
 def write_glb(
-    path,
-    rest,
-    poses,
-    moves,
-    names,
-    bind=None,
-    fps=24.0,
-    above=None,
-    interpolation="LINEAR",
-    more=(),
-    titles=(),
-    **more_of_file,
+    path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR", more=(), titles=(), **more_of_file
 ):
     """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]

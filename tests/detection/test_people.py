@@ -42,8 +42,7 @@ def check(person, joints, height, mask):
 
 
 @pytest.mark.parametrize(
-    ("view", "turns"),
-    [(0, 0), (1, 1), *(pytest.param(v, t, marks=pytest.mark.slow) for v in range(4) for t in range(4))],
+    ("view", "turns"), [(0, 0), (1, 1), *(pytest.param(v, t, marks=pytest.mark.slow) for v in range(4) for t in range(4))]
 )
 def test_the_person_is_found_whichever_way_up_the_photo_is(networks, capture, view, turns):
     photo = np.ascontiguousarray(np.rot90(capture.images[view], turns), np.float32)

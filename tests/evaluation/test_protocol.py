@@ -83,8 +83,7 @@ def test_the_square_box(seed):
     at = (np.arange(side) + 0.5) * largest / side - 0.5
     grid = np.meshgrid(at, at, indexing="ij")
     expected = np.stack(
-        [ndimage.map_coordinates(square[..., c].astype(float), grid, order=1, mode="nearest") for c in range(3)],
-        axis=-1,
+        [ndimage.map_coordinates(square[..., c].astype(float), grid, order=1, mode="nearest") for c in range(3)], axis=-1
     )
     np.testing.assert_allclose(SquareBox(margin, side).cut(image, mask, 1.0), expected, atol=1e-5)
 
@@ -107,11 +106,7 @@ def test_the_centred_window(seed):
 def test_the_centred_window_is_of_the_published_size():
     image, mask = blob(1, 256, 256)
     assert PROTOCOLS["ghg"].crop.cut(image, mask, 0.0).shape == (1000, 500, 3)
-    assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (
-        1000,
-        400,
-        3,
-    )  # narrower than the window
+    assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (1000, 400, 3)  # narrower than the window
 
 
 def test_only_black_protocols_have_black_behind():

@@ -27,9 +27,7 @@ def torchmetrics_ssim(x, y):
     moment = lambda a: np.stack(
         [
             np.einsum(
-                "yxij,ij->yx",
-                np.lib.stride_tricks.sliding_window_view(np.pad(a[..., c], 5, mode="reflect"), (11, 11)),
-                kernel,
+                "yxij,ij->yx", np.lib.stride_tricks.sliding_window_view(np.pad(a[..., c], 5, mode="reflect"), (11, 11)), kernel
             )
             for c in range(3)
         ]

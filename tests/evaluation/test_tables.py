@@ -70,18 +70,7 @@ def test_the_csv_reads_back():
     assert float(found[-1]["psnr"]) == 1 / 3 and found[-1]["patch_psnr"] == "" and found[2]["frame"] == "1"
 
 
-HOSTILE = (
-    "=1+1",
-    "@SUM(A1)",
-    "+cmd",
-    "-2",
-    " =1",
-    "\uff1d1",
-    "\t=1",
-    "<img src=x onerror=alert(1)>",
-    "a|b",
-    "a\nb\x1b[2J",
-)
+HOSTILE = ("=1+1", "@SUM(A1)", "+cmd", "-2", " =1", "\uff1d1", "\t=1", "<img src=x onerror=alert(1)>", "a|b", "a\nb\x1b[2J")
 HOSTILE += ("[here](javascript:alert(1))", "\\|`x`", "\\input{secret}")
 
 

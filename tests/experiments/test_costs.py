@@ -58,10 +58,7 @@ def test_loops_of_unknown_length_count_once():
 def test_a_convolution_and_its_gradients(stride):
     image, kernel = jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 5))
     apply = functools.partial(
-        jax.lax.conv_general_dilated,
-        window_strides=(stride, stride),
-        padding="SAME",
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        jax.lax.conv_general_dilated, window_strides=(stride, stride), padding="SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
     expected = 2 * (8 // stride) ** 2 * 9 * 3 * 5
     assert count(apply, image, kernel).convolutions == expected
@@ -86,11 +83,7 @@ def test_messages_of_one_device():
     costs = count(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False), jnp.zeros((64, 8)))
     whole = 4 * 64 * 8
     assert costs.messages == {"all_gather": 1, "psum": 5, "reduce_scatter": 1}
-    assert costs.sent == {
-        "all_gather": whole * 3 // 4,
-        "psum": 5 * 2 * whole * 3 // 4,
-        "reduce_scatter": whole * 3 // 4,
-    }
+    assert costs.sent == {"all_gather": whole * 3 // 4, "psum": 5 * 2 * whole * 3 // 4, "reduce_scatter": whole * 3 // 4}
 
 
 def test_temporaries():

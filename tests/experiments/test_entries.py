@@ -32,11 +32,7 @@ CASES = {
     "training_steps": "--repeats 1 --only",
 }
 """Options of each; the last words are given whole."""
-LAST = {
-    "fit_sequences": ["all frames seen"],
-    "training_extremes": ["as it is", "float16 compute"],
-    "training_steps": ["tiny 32"],
-}
+LAST = {"fit_sequences": ["all frames seen"], "training_extremes": ["as it is", "float16 compute"], "training_steps": ["tiny 32"]}
 
 
 @pytest.fixture(autouse=True)

@@ -17,13 +17,7 @@ def queue():
 
 def run(psnr, photos=4, **others):
     scores = {"psnr": psnr + 6, "psnr_fg": psnr, "ssim": 0.9, **others}
-    return {
-        "by_views": {str(photos): scores},
-        "photos": photos,
-        "parameters": 1_200_000,
-        "steps": 40,
-        "cpu_seconds": 60.4,
-    }
+    return {"by_views": {str(photos): scores}, "photos": photos, "parameters": 1_200_000, "steps": 40, "cpu_seconds": 60.4}
 
 
 def test_variants_are_compared_with_variants_and_differ_from_them(queue):

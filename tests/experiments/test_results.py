@@ -44,11 +44,7 @@ def test_images_are_what_their_names_say(pattern, begins):
 def test_sections_are_data_and_text_again():
     text = f"One line,\nanother.\n\n{TABLE}\n\nMore."
     blocks = blocks_of(text)
-    assert blocks[1] == {
-        "header": ["run", "PSNR", "name"],
-        "align": "lrl",
-        "rows": [["a", "1.0", "x"], ["b", "2.0", "y"]],
-    }
+    assert blocks[1] == {"header": ["run", "PSNR", "name"], "align": "lrl", "rows": [["a", "1.0", "x"], ["b", "2.0", "y"]]}
     assert text_of(json.loads(json_text(blocks))) == text
 
 

@@ -10,14 +10,7 @@ from experiments.tradeoff_report import points
 def row(name, reconstruct, frame, psnr, start="network", steps=0):
     scores = {task: {"psnr": psnr, "ssim": 0.9, "psnr_fg": psnr - 6} for task in report.TASKS}
     settings = {"refine_iterations": 0, "refine_steps": steps}
-    return {
-        "name": name,
-        "reconstruct": reconstruct,
-        "frame": frame,
-        "start": start,
-        "size": 512,
-        "settings": settings,
-    } | scores
+    return {"name": name, "reconstruct": reconstruct, "frame": frame, "start": start, "size": 512, "settings": settings} | scores
 
 
 def test_the_front_has_what_nothing_else_beats():

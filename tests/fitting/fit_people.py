@@ -19,19 +19,9 @@ SIZE = 512
 VIEWS = 4
 
 POSES = {
-    "standing": {
-        "left_shoulder": (0, 0, -1.2),
-        "left_elbow": (0, -0.4, 0),
-        "left_hip": (-0.3, 0, 0),
-        "left_knee": (0.5, 0, 0),
-    },
+    "standing": {"left_shoulder": (0, 0, -1.2), "left_elbow": (0, -0.4, 0), "left_hip": (-0.3, 0, 0), "left_knee": (0.5, 0, 0)},
     "arms above head": {"left_shoulder": (0, -0.2, 1.3), "left_elbow": (0, -0.3, 0)},
-    "crouching": {
-        "left_hip": (-1.6, 0.2, 0.1),
-        "left_knee": (1.9, 0, 0),
-        "left_ankle": (-0.5, 0, 0),
-        "spine1": (0.3, 0, 0),
-    },
+    "crouching": {"left_hip": (-1.6, 0.2, 0.1), "left_knee": (1.9, 0, 0), "left_ankle": (-0.5, 0, 0), "spine1": (0.3, 0, 0)},
     "lying": {"pelvis": (-np.pi / 2, 0, 0), "left_shoulder": (0, 0, -1.0)},
     "facing away": {"pelvis": (0, 3.0, 0), "left_elbow": (0, -1.0, 0)},
 }

@@ -362,12 +362,7 @@ def test_plots_of_extremes(errors):
 
 @pytest.mark.parametrize(
     "highest, count, whole, ticks",
-    [
-        (10.5, 4, False, [0, 5, 10]),
-        (2.6, 4, False, [0, 1, 2]),
-        (0.03, 4, False, [0, 0.01, 0.02, 0.03]),
-        (1, 9, True, [0, 1]),
-    ],
+    [(10.5, 4, False, [0, 5, 10]), (2.6, 4, False, [0, 1, 2]), (0.03, 4, False, [0, 0.01, 0.02, 0.03]), (1, 9, True, [0, 1])],
 )
 def test_ticks_are_round(highest, count, whole, ticks):
     np.testing.assert_allclose(module._ticks(highest, count, whole), ticks)

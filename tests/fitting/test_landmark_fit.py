@@ -207,13 +207,7 @@ def test_a_fit_that_knows_the_places_recovers_the_body_and_one_that_does_not_is_
     assert errors["plain"] > BIASED * errors["knowing"]
 
 
-MOVED = {
-    "hip": (-20, 10, 25),
-    "shoulder": (-10, 35, 0),
-    "ear": (-30, 0, 30),
-    "ankle": (0, 10, -10),
-    "nose": (0, 10, 20),
-}
+MOVED = {"hip": (-20, 10, 25), "shoulder": (-10, 35, 0), "ear": (-30, 0, 30), "ankle": (0, 10, -10), "nose": (0, 10, 20)}
 """Millimetres by which a detector sees landmarks of the left side beside where the body has them."""
 LESS, CLOSER, HARMLESS = 0.9, 0.7, 1.1
 """Most of the error of the joints of a fit that finds the places, over one that does not; of the error of the places over their

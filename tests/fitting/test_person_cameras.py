@@ -17,12 +17,7 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.camera_errors import find_camera_errors, mended
 from humangs_jax.fitting.fit_capture import examine, fit_photos
-from humangs_jax.fitting.person_cameras import (
-    SeveralMomentsError,
-    cameras_from_person,
-    cameras_of_moment,
-    scaled_to_height,
-)
+from humangs_jax.fitting.person_cameras import SeveralMomentsError, cameras_from_person, cameras_of_moment, scaled_to_height
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from tests.fitting.seen_people import person
@@ -36,8 +31,7 @@ NOISY_DEGREES, NOISY_METRES = 3.5, 0.25
 
 
 @pytest.mark.parametrize(
-    ("views", "pose"),
-    [(4, "crouching"), *(pytest.param(views, "standing", marks=pytest.mark.slow) for views in (3, 8))],
+    ("views", "pose"), [(4, "crouching"), *(pytest.param(views, "standing", marks=pytest.mark.slow) for views in (3, 8))]
 )
 def test_exact_landmarks_give_exact_cameras(views, pose):
     matrices = cameras_around(views)

@@ -419,11 +419,7 @@ def case(problem):
     normals = rng.normal(size=(600, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     matches = ScanMatches(
-        jnp.asarray(rows, jnp.int32),
-        number(rng.normal(size=(600, 3))),
-        number(normals),
-        jnp.full(600, 0.02),
-        jnp.ones(600),
+        jnp.asarray(rows, jnp.int32), number(rng.normal(size=(600, 3))), number(normals), jnp.full(600, 0.02), jnp.ones(600)
     )
     given = Given(jnp.zeros((2, 3)), jnp.ones(2), number(0.1), number(1.8), number(1))
     state = start_state(problem, problem.prior.mean)

@@ -200,12 +200,7 @@ def test_people_bend_within_their_limits(pose):
 
 @pytest.mark.parametrize(
     ("joint", "vector", "axis"),
-    [
-        ("left_knee", (-0.6, 0, 0), 0),
-        ("right_elbow", (0, -0.8, 0), 1),
-        ("left_index2", (0, 0, 1.2), 2),
-        ("head", (1.6, 0, 0), 0),
-    ],
+    [("left_knee", (-0.6, 0, 0), 0), ("right_elbow", (0, -0.8, 0), 1), ("left_index2", (0, 0, 1.2), 2), ("head", (1.6, 0, 0), 0)],
 )
 def test_what_no_joint_does_is_found(joint, vector, axis):
     rotations = rotations_of("standing")

@@ -209,15 +209,8 @@ for kind, rate in RATES.items():
     for reader in ("filmed", "motion npz"):
         arrays_case(f"a rate of {kind}", reader, honest.motion_arrays, to(fps=np.asarray(rate)), 5)
 MANY = {
-    "300,000 frames": {
-        "rotations": np.zeros((300_000, 55, 3), np.float32),
-        "translations": np.zeros((300_000, 3), np.float32),
-    },
-    "9,000 frames of 100 seconds each": {
-        "rotations": np.zeros((9000, 55, 3)),
-        "translations": np.zeros((9000, 3)),
-        "fps": 0.01,
-    },
+    "300,000 frames": {"rotations": np.zeros((300_000, 55, 3), np.float32), "translations": np.zeros((300_000, 3), np.float32)},
+    "9,000 frames of 100 seconds each": {"rotations": np.zeros((9000, 55, 3)), "translations": np.zeros((9000, 3)), "fps": 0.01},
 }
 for kind, changes in MANY.items():
     arrays_case(kind, "filmed", lambda changes=changes: honest.motion_arrays(**changes), lambda arrays: None, 5)

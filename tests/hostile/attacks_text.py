@@ -180,11 +180,7 @@ def weights_changed(folder):
 
 
 case("one flipped bit in a tensor", "weights", weights_changed, item=3)
-for kind, line in {
-    "a slash": b"/",
-    "a frame of 5,000 digits": b"cam00/" + b"9" * 5000,
-    "no camera": b"00000001.jpg",
-}.items():
+for kind, line in {"a slash": b"/", "a frame of 5,000 digits": b"cam00/" + b"9" * 5000, "no camera": b"00000001.jpg"}.items():
     case(f"a line of {kind}", "missing photos", changed("missing photos", lambda _, line=line: line), item=6)
 
 
@@ -243,11 +239,7 @@ RUNS = {
 for path, values in RUNS.items():
     for value in values:
         case(f"{path} {str(value)[:40]}", "configuration", configuration(path, value))
-for path, value in (
-    ("encoder.texture.resolution", 10**9),
-    ("decoder.free", 10**9),
-    ("encoder.transformer.width", 10**12),
-):
+for path, value in (("encoder.texture.resolution", 10**9), ("decoder.free", 10**9), ("encoder.transformer.width", 10**12)):
     case(f"{path} {value}", "weights", weights_with(path, value))
 
 
@@ -327,10 +319,7 @@ NOBODY = '{"pose_keypoints_2d":[]}'
 FEW_BYTES = {
     "a million people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 1_000_000) + "]}"),
     "110,000 people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 110_000) + "]}"),
-    "a million images": (
-        "coco annotations",
-        lambda: '{"annotations":[],"images":[' + ",".join(["0"] * 1_000_000) + "]}",
-    ),
+    "a million images": ("coco annotations", lambda: '{"annotations":[],"images":[' + ",".join(["0"] * 1_000_000) + "]}"),
     "a million frames": ("mmpose", lambda: "[" + ",".join(['{"frame_id":0,"instances":[]}'] * 1_000_000) + "]"),
     "200,000 instances": ("mmpose", lambda: '[{"frame_id":0,"instances":[' + ",".join(["0"] * 200_000) + "]}]"),
     "200,000 results": ("coco", lambda: "[" + ",".join(['{"image_id":0}'] * 200_000) + "]"),

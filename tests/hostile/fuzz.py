@@ -43,26 +43,7 @@ LARGEST = 1 << 26
 MOST_MAPPINGS = 20_000
 """Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the fuzzer starts itself again."""
 
-NUMBERS = [
-    0,
-    1,
-    -1,
-    2,
-    7,
-    255,
-    2**15,
-    2**31 - 1,
-    2**31,
-    2**32,
-    2**63,
-    -(2**63),
-    10**30,
-    0.5,
-    1e30,
-    1e400,
-    -1e400,
-    np.nan,
-]
+NUMBERS = [0, 1, -1, 2, 7, 255, 2**15, 2**31 - 1, 2**31, 2**32, 2**63, -(2**63), 10**30, 0.5, 1e30, 1e400, -1e400, np.nan]
 VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
 VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")

@@ -182,28 +182,12 @@ QUALISYS = """<calibration><cameras><camera serial="7">
 
 
 def panoptic():
-    entry = {
-        "name": "a",
-        "K": K,
-        "distCoef": [0.0] * 5,
-        "R": np.eye(3).tolist(),
-        "t": [[0], [1], [3]],
-        "resolution": [9, 9],
-    }
+    entry = {"name": "a", "K": K, "distCoef": [0.0] * 5, "R": np.eye(3).tolist(), "t": [[0], [1], [3]], "resolution": [9, 9]}
     return {"cameras": [entry, entry | {"name": "b"}]}
 
 
 def shelf():
-    entry = {
-        "fx": 60,
-        "fy": 60,
-        "cx": 5,
-        "cy": 6,
-        "R": np.eye(3).tolist(),
-        "T": [[0], [1], [3]],
-        "k": [0, 0, 0],
-        "p": [0, 0],
-    }
+    entry = {"fx": 60, "fy": 60, "cx": 5, "cy": 6, "R": np.eye(3).tolist(), "T": [[0], [1], [3]], "k": [0, 0, 0], "p": [0, 0]}
     return {"0": entry, "1": entry}
 
 
@@ -307,11 +291,7 @@ TRAM = {"pred_rotmat": np.tile(np.eye(3), (3, 24, 1, 1)), "pred_trans": np.zeros
 
 def mhr():
     points = np.random.default_rng(3).normal(size=(2, 127, 3))
-    return {
-        "pred_joint_coords": points,
-        "pred_cam_t": np.zeros((2, 3)),
-        "pred_global_rots": np.tile(np.eye(3), (2, 127, 1, 1)),
-    }
+    return {"pred_joint_coords": points, "pred_cam_t": np.zeros((2, 3)), "pred_global_rots": np.tile(np.eye(3), (2, 127, 1, 1))}
 
 
 def write_easymocap_motion(folder):
@@ -325,13 +305,7 @@ def text_ply():
     """Of Gaussians, in text."""
     names = [*"xyz", *(f"{kind}_{i}" for kind in ("f_dc", "scale") for i in range(3)), "opacity"]
     names += [f"rot_{i}" for i in range(4)]
-    header = [
-        "ply",
-        "format ascii 1.0",
-        "element vertex 4",
-        *(f"property float {name}" for name in names),
-        "end_header",
-    ]
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {name}" for name in names), "end_header"]
     return "\n".join([*header, *[" ".join(["0.5"] * len(names))] * 4, ""])
 
 
@@ -339,19 +313,8 @@ def compressed_ply():
     """Of PlayCanvas, with harmonics."""
     bounds = [f"{end}_{name}" for end in ("min", "max") for name in (*"xyz", "scale_x", "scale_y", "scale_z")]
     words = [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "element chunk 1",
-        *(f"property float {name}" for name in bounds),
-    ]
-    header += [
-        "element vertex 4",
-        *words,
-        "element sh 4",
-        *(f"property uchar f_rest_{i}" for i in range(9)),
-        "end_header\n",
-    ]
+    header = ["ply", "format binary_little_endian 1.0", "element chunk 1", *(f"property float {name}" for name in bounds)]
+    header += ["element vertex 4", *words, "element sh 4", *(f"property uchar f_rest_{i}" for i in range(9)), "end_header\n"]
     body = np.repeat(np.float32([-1, 1]), 6).tobytes() + np.arange(16, dtype="<u4").tobytes() + bytes(36)
     return "\n".join(header).encode() + body
 

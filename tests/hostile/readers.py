@@ -223,19 +223,13 @@ ROWS = {
     "wham": (load_motion, written("m.pkl", lambda: joblib({0: WHAM}))),
     "phalp": (load_motion, written("m.pkl", pickled(honest.phalp))),
     "gvhmr": (load_motion, saved("m.pt", lambda path: write_checkpoint(path, {"smpl_params_global": tensors(PARTS)}))),
-    "gvhmr stream": (
-        load_motion,
-        saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)})),
-    ),
+    "gvhmr stream": (load_motion, saved("m.pt", lambda path: write_stream(path, {"smpl_params_global": tensors(PARTS)}))),
     "tram": (load_motion, saved("m.npy", lambda path: np.save(path, honest.TRAM, allow_pickle=True))),
     "human3r": (
         load_motion,
         npz("m.npz", lambda: zeros(rotvec=(1, 53, 3), transl=(1, 3), smpl_id=(1,)) | {"cam2world": np.eye(4)}),
     ),
-    "smplcodec": (
-        load_motion,
-        saved("m.npz", lambda path: np.savez(path, bodyPose=np.zeros((3, 22, 3)), frameRate=24.0)),
-    ),
+    "smplcodec": (load_motion, saved("m.npz", lambda path: np.savez(path, bodyPose=np.zeros((3, 22, 3)), frameRate=24.0))),
     "sam 3d": (load_motion, npz("m.npz", honest.mhr)),
     "easymocap motion": (load_motion, honest.write_easymocap_motion, "000000.json"),
     "bvh": (load_motion, written("m.bvh", BVH)),
@@ -252,10 +246,7 @@ ROWS = {
     "stl": (read_mesh, honest.mesh("stl")),
     "off": (read_mesh, honest.mesh("off")),
     "joints json": (read_joints, written("j.json", as_json(JOINTS))),
-    "joints npz": (
-        read_joints,
-        npz("j.npz", lambda: {"names": np.asarray(["left_hip", "neck"])} | zeros(points=(2, 3))),
-    ),
+    "joints npz": (read_joints, npz("j.npz", lambda: {"names": np.asarray(["left_hip", "neck"])} | zeros(points=(2, 3)))),
     "fit record": (read_fit_record, npz("fit.npz", honest.fit_arrays)),
     "bank": (load_bank, npz("bank.npz", honest.bank_arrays)),
     "manifest": (continue_synthetic_set, written("manifest.json", as_json(honest.MANIFEST))),

@@ -28,14 +28,7 @@ from stand_ins import WORK, make_inputs, stand_ins
 
 SECONDS = 300
 """Longest that a run may take on a busy machine."""
-CHANGES = {
-    "open": (),
-    "os.rename": (2, 3),
-    "os.remove": (1,),
-    "os.mkdir": (2,),
-    "os.rmdir": (1,),
-    "subprocess.Popen": (),
-}
+CHANGES = {"open": (), "os.rename": (2, 3), "os.remove": (1,), "os.mkdir": (2,), "os.rmdir": (1,), "subprocess.Popen": ()}
 """Events of Python that change files, and which of their arguments are descriptors of folders."""
 
 
@@ -97,10 +90,7 @@ COMMANDS = (
         often=("begun/capture.json",),
         once=True,
     ),
-    Command(
-        "preprocess",
-        "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1",
-    ),
+    Command("preprocess", "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1"),
     Command(
         "evaluate",
         "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html a.html --csv a.csv "

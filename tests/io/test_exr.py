@@ -86,10 +86,7 @@ def test_other_types_become_float32(tmp_path):
 
 def test_half_precision_keeps_metres(tmp_path):
     """Colors, normals and parts in 16 bits; depth and positions to the last bit."""
-    channels = dict(make_view(0).channels) | {
-        "normal.X": make_view(0).rgba[..., 0],
-        "part": np.full((HEIGHT, WIDTH), 55.0),
-    }
+    channels = dict(make_view(0).channels) | {"normal.X": make_view(0).rgba[..., 0], "part": np.full((HEIGHT, WIDTH), 55.0)}
     view = make_view(0, channels=channels)
     write_exr(tmp_path / "half.exr", view, half=True)
     write_exr(tmp_path / "float.exr", view)
@@ -112,16 +109,10 @@ def with_small_channel():
 BAD = {
     "none": (lambda: [], "views: expected at least one"),
     "names": (lambda: [make_view(0), make_view(1, name="cam0")], "different names"),
-    "sizes": (
-        lambda: [make_view(0), ExrView(np.zeros((4, 4, 4), np.float32))],
-        "views: expected one image size",
-    ),
+    "sizes": (lambda: [make_view(0), ExrView(np.zeros((4, 4, 4), np.float32))], "views: expected one image size"),
     "half a camera": (lambda: make_view(0, K=None), "'cam0': expected both K and cam_from_world"),
     "channel size": (lambda: with_small_channel(), "'cam0': channel n: expected"),
-    "channel twice": (
-        lambda: make_view(0, channels={"Z": np.zeros((HEIGHT, WIDTH), np.float32)}),
-        "Z is there already",
-    ),
+    "channel twice": (lambda: make_view(0, channels={"Z": np.zeros((HEIGHT, WIDTH), np.float32)}), "Z is there already"),
     "attribute": (lambda: make_view(0, attributes={"type": "photo"}), "'cam0': attributes: type"),
 }
 

@@ -212,12 +212,7 @@ def test_nobody_and_everything(image, expected, tmp_path):
 
 def test_soft_masks_keep_their_greys(tmp_path):
     soft = np.linspace(0, 255, 96).reshape(12, 8).astype(np.uint8)
-    for image, _ in (
-        pixels(soft),
-        palette(soft, RAMP),
-        pixels(np.dstack([PHOTO, soft])),
-        pixels(np.dstack([soft] * 3)),
-    ):
+    for image, _ in (pixels(soft), palette(soft, RAMP), pixels(np.dstack([PHOTO, soft])), pixels(np.dstack([soft] * 3))):
         image.save(tmp_path / "mask.png")
         np.testing.assert_allclose(read_grey(tmp_path / "mask.png"), soft / 255, atol=1e-6)
 

@@ -26,11 +26,7 @@ BACKBONES = {  # name, in, out, size of the convolutions that are looked at, as 
         *fire(12, 512, 64, 256),
     ],
 }
-HEADS = {
-    "vgg": (64, 128, 256, 512, 512),
-    "alex": (64, 192, 384, 256, 256),
-    "squeeze": (64, 128, 256, 384, 384, 512, 512),
-}
+HEADS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256), "squeeze": (64, 128, 256, 384, 384, 512, 512)}
 SEED = 2026
 
 

@@ -131,10 +131,7 @@ slow = lambda *case: pytest.param(*case, marks=pytest.mark.slow)
 
 @pytest.mark.parametrize(
     ("name", "dtype"),
-    [
-        ("alex", "float64"),
-        *(slow(name, dtype) for dtype in ("float32", "float64") for name in TABLES if name != "alex"),
-    ],
+    [("alex", "float64"), *(slow(name, dtype) for dtype in ("float32", "float64") for name in TABLES if name != "alex")],
 )
 def test_the_numbers_and_gradients_of_torch(name, dtype):
     stored, kind = np.load(DATA / "torch_losses.npz"), "perceptual" if name == "vgg19" else name

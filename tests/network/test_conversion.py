@@ -15,14 +15,7 @@ from torch_writer import FakeTensor, tensors, write_checkpoint
 
 from humangs_jax.losses.loss_networks import expected_tensors, load_lpips
 from humangs_jax.network.config import paper_parts
-from humangs_jax.network.conversion import (
-    describe,
-    expected_shapes,
-    infer_config,
-    load_checkpoint,
-    read_state_dict,
-    to_release,
-)
+from humangs_jax.network.conversion import describe, expected_shapes, infer_config, load_checkpoint, read_state_dict, to_release
 from humangs_jax.network.presets import published
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.weights import load_weights
@@ -173,22 +166,13 @@ REFUSED = {
         change("transformer_blocks.0.attn.bias.weight", np.zeros(3, np.float32)),
         "'transformer_blocks.0.attn.bias.weight' is not part",
     ),
-    "a block of no number": (
-        change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)),
-        "transformer_blocks",
-    ),
+    "a block of no number": (change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)), "transformer_blocks"),
     "a block too far": (
         change("transformer_blocks.99.norm1.weight", np.zeros(16, np.float32)),
         "'transformer_blocks.4.norm1.weight' is missing",
     ),
-    "canonical target maps": (
-        change("target_pose_tokenizer.1.weight", np.zeros(3, np.float32)),
-        "target_pose_tokenizer",
-    ),
-    "not finite": (
-        change("norm.bias", np.full(16, np.nan, np.float32)),
-        "'norm.bias' holds numbers that are not finite",
-    ),
+    "canonical target maps": (change("target_pose_tokenizer.1.weight", np.zeros(3, np.float32)), "target_pose_tokenizer"),
+    "not finite": (change("norm.bias", np.full(16, np.nan, np.float32)), "'norm.bias' holds numbers that are not finite"),
     "class token removed": (
         lambda state: {key: x for key, x in state.items() if key != "cls_token"},
         "'vertex_decoder.trunk.0.weight' has shape",
@@ -222,10 +206,7 @@ def test_the_command_refuses_code(tmp_path, monkeypatch, capsys):
 
 def test_the_command_converts(tmp_path, monkeypatch, capsys):
     state = oracle.random_state(Options(qk_norm=False))
-    losses = {
-        "loss_computer.a": FakeTensor(np.ones(2, np.float32)),
-        "loss_computer.b": FakeTensor(np.ones(2, np.float32)),
-    }
+    losses = {"loss_computer.a": FakeTensor(np.ones(2, np.float32)), "loss_computer.b": FakeTensor(np.ones(2, np.float32))}
     path = write_checkpoint(tmp_path / "a.pt", {"model": tensors(state) | losses, "optimizer": {}})
     weights = tmp_path / "w.safetensors"
     code, out, error = run(monkeypatch, capsys, "convert", path, "--out", weights, "--head-width", "4", "--pool", "visible")

@@ -142,9 +142,7 @@ def test_the_order_of_the_views_does_not_matter():
     inputs, order = random_inputs(), jnp.asarray([1, 0])
     per_view = {name: getattr(inputs, name) for name in PER_VIEW}
     permuted = replace(
-        inputs,
-        cameras=jax.tree.map(lambda x: x[order], inputs.cameras),
-        **{name: x[order] for name, x in per_view.items()},
+        inputs, cameras=jax.tree.map(lambda x: x[order], inputs.cameras), **{name: x[order] for name, x in per_view.items()}
     )
     variables = variables_of(ALL_TOKENS)
     (encoding, outputs), (other_encoding, other_outputs) = (run(variables, x, ALL_TOKENS) for x in (inputs, permuted))

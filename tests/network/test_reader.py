@@ -112,10 +112,7 @@ def test_at_the_edge_of_a_mask_a_shell_has_the_color_of_the_person_alone():
     images = jnp.asarray([0.9, 0.6, 0.3]) * jnp.ones((1, *SIZE[::-1], 3))
     mask = jnp.arange(SIZE[0]) < 16
     images, foreground = jnp.where(mask[:, None], images, 1.0), jnp.broadcast_to(mask, (1, *SIZE[::-1]))
-    vertex, normal = (
-        jnp.asarray([[[0.0, 0.0, 2.0]]]),
-        jnp.asarray([[[0.0, 0.0, -1.0]]]),
-    )  # at the middle: the mask's edge
+    vertex, normal = (jnp.asarray([[[0.0, 0.0, 2.0]]]), jnp.asarray([[[0.0, 0.0, -1.0]]]))  # at the middle: the mask's edge
     nothing = jnp.full((1, *SIZE[::-1]), -1.0)
     shells = sample_shells(images, foreground, nothing, camera, vertex, normal, (0.0,), jnp.ones(1, bool), "half_pixel")
     np.testing.assert_allclose(shells.colors[0, 0], [0.9, 0.6, 0.3], rtol=1e-5)

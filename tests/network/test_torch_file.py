@@ -244,10 +244,7 @@ def test_parts_of_storages_in_old_streams(tmp_path):
 
 def test_state_dicts_that_python_2_wrote(tmp_path):
     numbers = np.arange(12, dtype=np.float32)
-    truth = {
-        "lin0.model.1.weight": numbers.reshape(1, 12, 1, 1),
-        "lin1.model.1.weight": numbers[:3].reshape(1, 3, 1, 1),
-    }
+    truth = {"lin0.model.1.weight": numbers.reshape(1, 12, 1, 1), "lin1.model.1.weight": numbers[:3].reshape(1, 3, 1, 1)}
     state, skipped = read_torch_file(write_python2_stream(tmp_path / "a.pth", truth))
     assert skipped == 0 and list(state) == list(truth)
     for key, expected in truth.items():

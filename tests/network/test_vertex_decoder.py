@@ -27,9 +27,7 @@ NORMALS = jnp.asarray([[1.0, 0, 0], [0, 0.6, 0.8]])
 def random_raw(seed=0, n=4):
     rng = np.random.default_rng(seed)
     return RawGaussians(
-        jnp.asarray(rng.normal(size=(n, 2, 10)), jnp.float32),
-        jnp.asarray(rng.normal(size=(n, 2, 4)), jnp.float32),
-        None,
+        jnp.asarray(rng.normal(size=(n, 2, 10)), jnp.float32), jnp.asarray(rng.normal(size=(n, 2, 4)), jnp.float32), None
     )
 
 

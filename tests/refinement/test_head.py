@@ -92,8 +92,7 @@ def test_where_no_photo_shows_a_head_there_are_no_crops(four, spoil):
 
 
 @pytest.mark.parametrize(
-    ("longest", "image_size", "expected"),
-    [(512, None, True), (2000, 512, True), (2000, 256, False), (256, None, False)],
+    ("longest", "image_size", "expected"), [(512, None, True), (2000, 512, True), (2000, 256, False), (256, None, False)]
 )
 def test_photos_must_be_large_enough(four, longest, image_size, expected):
     capture = dataclasses.replace(four[1], images=np.zeros((4, longest, 4, 3), np.float32), masks=None)

@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from rounding import UNIT
 
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
-from humangs_jax.rendering.mesh.rasterizer import (
-    Fragments,
-    RasterConfig,
-    interpolate_attributes,
-    rasterize_mesh,
-    sample_texture,
-)
+from humangs_jax.rendering.mesh.rasterizer import Fragments, RasterConfig, interpolate_attributes, rasterize_mesh, sample_texture
 
 PIXEL_ERROR = 1e-4
 """Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""

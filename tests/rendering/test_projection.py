@@ -58,10 +58,7 @@ def test_moving_world_and_camera_together_changes_nothing(float64):
     q = quaternion.normalize(jnp.asarray([0.3, -0.5, 0.7, 0.2]))
     move = transform.make(quaternion.to_matrix(q), jnp.asarray([1.0, -2.0, 0.5]))
     moved = replace(
-        gaussians,
-        means=transform.apply(move, gaussians.means),
-        quats=quaternion.multiply(q, gaussians.quats),
-        deformations=None,
+        gaussians, means=transform.apply(move, gaussians.means), quats=quaternion.multiply(q, gaussians.quats), deformations=None
     )
     moved_view = replace(view, cam_from_world=view.cam_from_world @ transform.invert_rigid(move))
     pair = project(replace(gaussians, deformations=None), view), project(moved, moved_view)

@@ -65,12 +65,7 @@ def test_nearer_covers_farther_whatever_the_order():
 
 
 def test_a_pixel_ends_before_the_splat_that_would_exhaust_it():
-    opacities = [
-        0.99,
-        0.98,
-        0.6,
-        0.5,
-    ]  # T: 1e-2, 2e-4, then 8e-5 <= 1e-4: neither the third nor anything after it counts
+    opacities = [0.99, 0.98, 0.6, 0.5]  # T: 1e-2, 2e-4, then 8e-5 <= 1e-4: neither the third nor anything after it counts
     rendering = render_reference(on_axis([1.0, 2.0, 3.0, 4.0], opacities, [[0.0] * 3] * 4), axis_camera())
     np.testing.assert_allclose(rendering.rgb[4, 4], 2e-4, atol=EXACT)
 

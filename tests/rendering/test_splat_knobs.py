@@ -170,15 +170,7 @@ def test_one_plan_serves_an_animation():
 
 
 def test_settings_are_checked():
-    several = {
-        "radius_sigma": 0.0,
-        "square": True,
-        "scale": 0.0,
-        "chunk": 0,
-        "alpha_min": 0.0,
-        "alpha_max": 1.0,
-        "near": -1.0,
-    }
+    several = {"radius_sigma": 0.0, "square": True, "scale": 0.0, "chunk": 0, "alpha_min": 0.0, "alpha_max": 1.0, "near": -1.0}
     for wrong in ({name: value} for name, value in (several | {"max_pairs": 0}).items()):
         with pytest.raises(ValueError, match="SplatConfig"):
             SplatConfig(**wrong)

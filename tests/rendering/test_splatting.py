@@ -151,11 +151,7 @@ def test_gradients_are_derivatives():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "config",
-    [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)],
-    ids=["default", "tile 5"],
-)
+@pytest.mark.parametrize("config", [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)], ids=["default", "tile 5"])
 def test_the_schedule_does_not_change_the_image(config):
     with jax.enable_x64(True):
         gaussians = random_gaussians(5)

@@ -68,10 +68,7 @@ def test_wrong_values_of_cameras_are_named():
     for change, words in (
         ({"K": view.K.at[0, 2].set(np.nan)}, "camera.K: expected finite numbers"),
         ({"K": view.K.at[1, 1].set(-500.0)}, "camera.K focal lengths: expected finite numbers > 0"),
-        (
-            {"cam_from_world": view.cam_from_world.at[0, 3].set(np.inf)},
-            "camera.cam_from_world: expected finite numbers",
-        ),
+        ({"cam_from_world": view.cam_from_world.at[0, 3].set(np.inf)}, "camera.cam_from_world: expected finite numbers"),
     ):
         with pytest.raises(ValueError, match=words):
             render(scene(), replace(view, **change), CONFIG)

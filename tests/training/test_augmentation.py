@@ -94,9 +94,7 @@ def test_the_person_is_turned_about_wherever_it_stands(example):
     views = replace(views, translations=views.translations + jnp.asarray([5.0, 0.0, 0.0]))
     off = augment_views(jax.random.key(5), views, pelvis, dataclasses.replace(NOTHING, camera_degrees=5.0))
     seen = lambda cameras: jnp.einsum(
-        "vij,vj->vi",
-        cameras.cam_from_world[:, :3],
-        jnp.pad(views.translations + pelvis, ((0, 0), (0, 1)), constant_values=1),
+        "vij,vj->vi", cameras.cam_from_world[:, :3], jnp.pad(views.translations + pelvis, ((0, 0), (0, 1)), constant_values=1)
     )
     np.testing.assert_allclose(seen(off.cameras), seen(views.cameras), atol=1e-4)
     assert np.abs(off.cameras.cam_from_world - views.cameras.cam_from_world).max() > 0.01

@@ -181,8 +181,7 @@ def nan_gradient(x):
 
 
 nan_gradient.defvjp(
-    lambda x: (x, None),
-    lambda _, g: (g.at[(-1,) * g.ndim].set(jnp.nan) if jnp.issubdtype(g.dtype, jnp.inexact) else g,),
+    lambda x: (x, None), lambda _, g: (g.at[(-1,) * g.ndim].set(jnp.nan) if jnp.issubdtype(g.dtype, jnp.inexact) else g,)
 )
 
 

@@ -37,12 +37,7 @@ def tensorboard_events(folder):
 
 def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
     path = tmp_path / "log.jsonl"
-    whole = [
-        {"step": 1, "loss": 0.5},
-        {"step": 2, "loss": 0.4},
-        {"step": 2, "val_psnr": 20.0},
-        {"step": 3, "loss": 0.3},
-    ]
+    whole = [{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4}, {"step": 2, "val_psnr": 20.0}, {"step": 3, "loss": 0.3}]
     path.write_text("".join(json.dumps(line) + "\n" for line in whole) + '{"step": 2, "lo')
     forget_after(path, 2)
     assert read(path) == whole[:3]
@@ -52,11 +47,7 @@ def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
 
 def test_what_is_no_log_is_one_line_and_stays_as_it_is(tmp_path):
     path = tmp_path / "log.jsonl"
-    for content in (
-        b"\xff\xfe",
-        b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n',
-        b'{"step": 1}\nhello\n{"step": 2}\n',
-    ):
+    for content in (b"\xff\xfe", b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n', b'{"step": 1}\nhello\n{"step": 2}\n'):
         path.write_bytes(content)
         with pytest.raises(FileError, match=re.escape(str(path))) as error:
             forget_after(path, 2)
@@ -91,10 +82,7 @@ def test_numbers_that_are_not_finite_are_no_json(tmp_path):
 
 def test_a_full_disk_names_the_log(tmp_path):
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
-    with (
-        pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"),
-        RunLog(tmp_path, 0, 10, progress=False) as log,
-    ):
+    with pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"), RunLog(tmp_path, 0, 10, progress=False) as log:
         log.event(3, "skipped", "skipped")
 
 

@@ -92,10 +92,7 @@ def test_a_signal_saves_and_ends_the_run(body, captures, variables, tmp_path, mo
 
     handler = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(loop, "train_step", interrupted)
-    with (
-        caplog.at_level(logging.WARNING),
-        pytest.raises(loop.TrainingInterrupted, match="after 1 of 60 steps") as stopped,
-    ):
+    with caplog.at_level(logging.WARNING), pytest.raises(loop.TrainingInterrupted, match="after 1 of 60 steps") as stopped:
         train(CONFIG, body, captures[:2], tmp_path, variables=variables, progress=False)
     assert int(stopped.value.state.step) == 1 and "stopping after this step" in caplog.text
     assert isinstance(stopped.value, KeyboardInterrupt)  # a loop of runs ends

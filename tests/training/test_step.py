@@ -30,14 +30,7 @@ from humangs_jax.training.augmentation import Augmentation
 from humangs_jax.training.config import OptimizerConfig, tiny
 from humangs_jax.training.forward import predict, token_share
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import (
-    batch_gradients,
-    change_background,
-    random_backgrounds,
-    seed_numbers,
-    train_step,
-    update,
-)
+from humangs_jax.training.step import batch_gradients, change_background, random_backgrounds, seed_numbers, train_step, update
 
 FLOAT64 = 1e-6
 FLOAT32 = 1e-5
@@ -256,10 +249,7 @@ def plain_update(monkeypatch):
 
     monkeypatch.setattr(step, "batch_gradients", gradients)
     batch = SimpleNamespace(inputs=SimpleNamespace(betas=jnp.zeros((2, 1))))
-    return lambda state: (
-        inspect.unwrap(update)(state, batch, None, LossNetworks(), seed_numbers(0), PLAIN)[0],
-        keys[-1],
-    )
+    return lambda state: (inspect.unwrap(update)(state, batch, None, LossNetworks(), seed_numbers(0), PLAIN)[0], keys[-1])
 
 
 def test_every_step_and_every_subject_has_random_numbers_of_its_own(plain_update):

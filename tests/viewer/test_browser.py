@@ -241,22 +241,10 @@ def z_up(poses):
 
 
 FILES = {
-    "ours": lambda poses, trans: {
-        "rotations": poses.reshape(-1, 55, 3).astype("f4"),
-        "translations": trans,
-        "fps": 24.0,
-    },
+    "ours": lambda poses, trans: {"rotations": poses.reshape(-1, 55, 3).astype("f4"), "translations": trans, "fps": 24.0},
     "amass z up": lambda poses, trans: {"poses": z_up(poses), "trans": trans, "mocap_framerate": 120.0},
-    "amass 156": lambda poses, trans: {
-        "poses": np.asfortranarray(z_up(poses[:, :156])),
-        "trans": trans,
-        "mocap_frame_rate": 60,
-    },
-    "amass 66": lambda poses, trans: {
-        "poses": poses[:, :66] * 0.3,
-        "trans": trans.astype("f4"),
-        "fps": np.asarray([30]),
-    },
+    "amass 156": lambda poses, trans: {"poses": np.asfortranarray(z_up(poses[:, :156])), "trans": trans, "mocap_frame_rate": 60},
+    "amass 66": lambda poses, trans: {"poses": poses[:, :66] * 0.3, "trans": trans.astype("f4"), "fps": np.asarray([30])},
     "thuman": lambda poses, trans: {"global_orient": poses[:, :3] * 0.2, "body_pose": poses[:, 3:66], "transl": trans},
 }
 
@@ -302,16 +290,10 @@ def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, 
 
 
 BAD_FILES = {
-    "truncated.npz": (
-        npz(poses=np.zeros((2, 165)), trans=np.zeros((2, 3)), fps=30)[:-60],
-        "not an npz archive, or cut short",
-    ),
+    "truncated.npz": (npz(poses=np.zeros((2, 165)), trans=np.zeros((2, 3)), fps=30)[:-60], "not an npz archive, or cut short"),
     "keys.npz": (npz(joints=np.zeros((2, 3))), "expected one of the keys rotations, smpl_poses, poses"),
     "width.npz": (npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30), "poses: expected frames of 165 or 156"),
-    "nan.npz": (
-        npz(poses=np.full((2, 66), np.nan), trans=np.zeros((2, 3)), fps=30),
-        "key poses: expected finite numbers",
-    ),
+    "nan.npz": (npz(poses=np.full((2, 66), np.nan), trans=np.zeros((2, 3)), fps=30), "key poses: expected finite numbers"),
     "rate.npz": (
         npz(poses=np.zeros((2, 66)), trans=np.zeros((2, 3)), fps=np.inf),
         "expected a positive number of frames per second",

@@ -107,10 +107,7 @@ def test_the_server_answers_with_the_newest_avatar_and_refuses_a_taken_port(pers
             return answer.read().decode()
 
     with live.LiveView() as view:
-        assert "fetch" in read("") and json.loads(read("state")) == {
-            "shown": 0,
-            "status": "Waiting for the first avatar ...",
-        }
+        assert "fetch" in read("") and json.loads(read("state")) == {"shown": 0, "status": "Waiting for the first avatar ..."}
         view.show(person, "first")
         assert read("avatar?1") == page_html(person)
         assert json.loads(read("state")) == {"shown": 1, "status": "first"}

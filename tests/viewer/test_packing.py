@@ -70,11 +70,7 @@ def test_harmonics_are_kept():
 def test_the_light_is_kept():
     avatar, rng = small_avatar(), np.random.default_rng(0)
     normals = rng.normal(size=avatar.gaussians.means.shape)
-    numbers = (
-        rng.normal(size=8),
-        normals / np.linalg.norm(normals, axis=1, keepdims=True),
-        rng.normal(size=len(normals)),
-    )
+    numbers = (rng.normal(size=8), normals / np.linalg.norm(normals, axis=1, keepdims=True), rng.normal(size=len(normals)))
     light = Light(*(jnp.asarray(x, jnp.float32) for x in numbers))
     packed = packing.pack(replace(avatar, light=light))
     arrays, header = packing.unpack(packed), packed.header
@@ -170,10 +166,7 @@ def spoiled(name, index, value):
     [
         ((spoiled("means", (3, 1), np.nan),), r"gaussians\.means"),
         ((spoiled("opacities", 2, 1.5),), r"gaussians\.opacities"),
-        (
-            (small_avatar(), Motion(jnp.zeros((2, 52, 3)), jnp.zeros((2, 3)))),
-            "the motion has 52 joints, the avatar has 3",
-        ),
+        ((small_avatar(), Motion(jnp.zeros((2, 52, 3)), jnp.zeros((2, 3)))), "the motion has 52 joints, the avatar has 3"),
         ((small_avatar(), Motion(jnp.full((2, 3, 3), jnp.inf), jnp.zeros((2, 3)))), r"motion\.rotations"),
         ((small_avatar(), None, small_body(seed=9)), "does not explain the avatar's vertices"),
         ((jax.tree.map(lambda x: x[:0], small_avatar()),), "has no Gaussians"),

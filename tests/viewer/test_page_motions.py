@@ -163,12 +163,7 @@ def array_files():
                 flat = turned.reshape(len(turned), -1)
                 name = f"{kind}, {up} up, heading {heading}"
                 files[f"AMASS: {name}"] = {"poses": flat, "trans": moved, "mocap_framerate": FPS}
-                files[f"parts: {name}"] = {
-                    "global_orient": flat[:, :3],
-                    "body_pose": flat[:, 3:66],
-                    "transl": moved,
-                    "fps": FPS,
-                }
+                files[f"parts: {name}"] = {"global_orient": flat[:, :3], "body_pose": flat[:, 3:66], "transl": moved, "fps": FPS}
     return files
 
 
@@ -206,28 +201,12 @@ BAD = {
     "slow": ("a.npz", npz(**POSES, fps=5e-324), "expected a positive number of frames per second"),
     "negative": ("a.npz", npz(**POSES, fps=-1), "expected a positive number of frames per second, got -1"),
     "far": ("a.npz", npz(**(POSES | {"trans": np.full((2, 3), 1e6)}), fps=30), "expected metres, at most 10000"),
-    "scaling": (
-        "a.npz",
-        npz(smpl_poses=np.zeros((2, 72)), smpl_trans=np.zeros((2, 3)), smpl_scaling=0),
-        "a positive number",
-    ),
-    "huge": (
-        "a.npz",
-        npz(**(POSES | {"poses": np.full((2, 66), 1e300)}), fps=30),
-        "key poses: expected finite numbers",
-    ),
+    "scaling": ("a.npz", npz(smpl_poses=np.zeros((2, 72)), smpl_trans=np.zeros((2, 3)), smpl_scaling=0), "a positive number"),
+    "huge": ("a.npz", npz(**(POSES | {"poses": np.full((2, 66), 1e300)}), fps=30), "key poses: expected finite numbers"),
     "keys": ("a.npz", npz(constructor=np.zeros((2, 3)), __proto__=np.zeros(2)), "expected one of the keys rotations, "),
-    "odd type": (
-        "a.npz",
-        npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30),
-        "expected one of the keys",
-    ),
+    "odd type": ("a.npz", npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30), "expected one of the keys"),
     "odd channel": ("a.bvh", HEAD.replace("Zrotation", "constructor").encode(), "expected up to 6 channels"),
-    "odd joint": (
-        "a.bvh",
-        (HEAD.replace("Hips", "__proto__") + "MOTION\nFrames: 1\nFrame Time: 1\n0 0 0").encode(),
-        "no joint",
-    ),
+    "odd joint": ("a.bvh", (HEAD.replace("Hips", "__proto__") + "MOTION\nFrames: 1\nFrame Time: 1\n0 0 0").encode(), "no joint"),
     "instant": ("a.bvh", (HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0").encode(), "a positive Frame Time"),
     "brace": ("a.bvh", b"HIERARCHY {", "unknown word {"),
     "open": ("a.bvh", b"HIERARCHY ROOT Hips { OFFSET 0 0 0", "a brace of the joints is open"),

@@ -142,10 +142,7 @@ for layout in ("avatarrex", "thuman4", "actorshq"):
 
 # Calibrations -----------------------------------------------------------------------------------------------------------
 
-for layout, file, camera in (
-    ("avatarrex", "calibration_full.json", "22010708"),
-    ("thuman4", "calibration.json", "cam00"),
-):
+for layout, file, camera in (("avatarrex", "calibration_full.json", "22010708"), ("thuman4", "calibration.json", "cam00")):
     this = functools.partial(case, layout)
     every(layout, file, "", whole=True)
     this("calibration missing", removed(file))
@@ -222,18 +219,8 @@ thuman(
 thuman("no leading axis", pkl(FIT, body_pose=lambda x: x[0]), PKL, "body_pose", "(63,)")
 thuman("degrees", pkl(FIT, global_orient=lambda x: np.rad2deg(x) + 90), "global_orient", "another unit?")
 thuman("millimetres", pkl(FIT, transl=lambda x: 1000 * x + 500), "transl", "another unit?")
-thuman(
-    "jaw and left eye exchanged with the root",
-    lambda f: pkl_swap(f, "jaw_pose", "global_orient"),
-    OBJ,
-    "mm from this mesh",
-)
-thuman(
-    "left and right hands exchanged",
-    lambda f: pkl_swap(f, "left_hand_pose", "right_hand_pose"),
-    OBJ,
-    "mm from this mesh",
-)
+thuman("jaw and left eye exchanged with the root", lambda f: pkl_swap(f, "jaw_pose", "global_orient"), OBJ, "mm from this mesh")
+thuman("left and right hands exchanged", lambda f: pkl_swap(f, "left_hand_pose", "right_hand_pose"), OBJ, "mm from this mesh")
 every("thuman", MESH, "")
 thuman("no fitted mesh", removed(MESH), OBJ, "no such file")
 thuman("a mesh of another model", text(MESH, "v ", "v 0 0 0\nv "), OBJ, "81 vertices")
@@ -246,9 +233,7 @@ every("thuman", "model/0001/material0.jpeg", "image")
 thuman("no texture", removed("model/0001/material0.jpeg"), "0001.obj", "texture")
 thuman("no material", removed("model/0001/material0.mtl"), "0001.obj", "texture")
 thuman(
-    "a texture outside of the folder",
-    text("model/0001/material0.mtl", "material0.jpeg", "../0000/material0.jpeg"),
-    "0001.obj",
+    "a texture outside of the folder", text("model/0001/material0.mtl", "material0.jpeg", "../0000/material0.jpeg"), "0001.obj"
 )
 thuman("a scan with a NaN", text(SCAN, "v ", "v nan 0 0\nv "), "0001.obj")
 thuman("no folder model", lambda f: (f / "model").rename(f / "models"), "model", "no such folder")
@@ -301,13 +286,7 @@ scenes("v_cano of another model", npz(ARRAYS, v_cano=lambda x: x[:-1]), "0.npz",
 scenes("v_cano of somebody else", npz(ARRAYS, v_cano=lambda x: x[::-1]), "0.npz", "v_cano", "mm from body")
 scenes("v_posed for v_cano", lambda f: swap_npz(f / ARRAYS, "v_cano", "v_posed"), "0.npz", "v_cano", "mm from body")
 scenes("a NaN in v_cano", npz(ARRAYS, v_cano=spoiled(np.nan)), "0.npz", "v_cano", "finite")
-scenes(
-    "joints that are no rotation",
-    npz(ARRAYS, joint_transforms=lambda x: 2 * x),
-    "0.npz",
-    "joint_transforms",
-    "no rotation",
-)
+scenes("joints that are no rotation", npz(ARRAYS, joint_transforms=lambda x: 2 * x), "0.npz", "joint_transforms", "no rotation")
 scenes("54 joints", npz(ARRAYS, joint_transforms=lambda x: x[1:]), "0.npz", "joint_transforms", "(54, 4, 4)")
 scenes("an object that runs code", object_npz(ARRAYS, "v_cano"), "0.npz", "v_cano", "pickled")
 scenes("a bomb", bomb(ARRAYS), "0.npz", "limit")
@@ -377,12 +356,7 @@ dna("a photo of other bytes", h5_set(PHOTO, lambda x: x[::-1], MAIN), PHOTO, "im
 dna("a photo of floats", h5_set(PHOTO, lambda x: x.astype(float), MAIN), PHOTO, "encoded bytes")
 dna("a mask cut off", h5_set(MASK, lambda x: x[: len(x) // 2]), MASK, "image")
 dna("an empty photo", h5_set(PHOTO, lambda x: x[:0], MAIN), PHOTO, "image")
-dna(
-    "no photo at all",
-    h5(MAIN, lambda f: [f[f"Camera_5mp/{c}/color"].clear() for c in (0, 1)]),
-    "0001_01.smc",
-    "no photo",
-)
+dna("no photo at all", h5(MAIN, lambda f: [f[f"Camera_5mp/{c}/color"].clear() for c in (0, 1)]), "0001_01.smc", "no photo")
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run as in_process
-from dataset_files import (
-    CAMERAS,
-    FRAMES,
-    model_arrays,
-    write_actorshq,
-    write_avatarrex,
-    write_model,
-    write_thuman,
-    write_thuman4,
-)
+from dataset_files import CAMERAS, FRAMES, model_arrays, write_actorshq, write_avatarrex, write_model, write_thuman, write_thuman4
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.cli import training
