@@ -116,11 +116,7 @@ PRESETS: Presets[Settings] = Presets(
     {
         "realtime": Settings(views=4, runtime=Runtime(crop=True, body_vertices=1000), splat="fast"),
         "balanced": Settings(
-            views=4,
-            runtime=Runtime(crop=True, body_vertices=2000),
-            refine_iterations=4,
-            refine_size=256,
-            splat="near_exact",
+            views=4, runtime=Runtime(crop=True, body_vertices=2000), refine_iterations=4, refine_size=256, splat="near_exact"
         ),
         "quality": Settings(views=4, runtime=Runtime(crop=True), refine_iterations=4, refine_size=512, splat="near_exact"),
         "best": Settings(runtime=Runtime(crop=True), refine_iterations=4, refine_steps=100, refine_size=512),
@@ -296,10 +292,7 @@ def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[st
 
     memory = None if any(cost.memory_mb is None for _, cost in known) else part("memory_mb", lambda c: c.memory_mb or 0.0)
     return Cost(
-        part("make", lambda c: c.make_ms),
-        part("refine", lambda c: c.refine_ms),
-        part("frame", lambda c: c.frame_ms),
-        memory,
+        part("make", lambda c: c.make_ms), part("refine", lambda c: c.refine_ms), part("frame", lambda c: c.frame_ms), memory
     )
 
 

@@ -31,16 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.joints import FINGERS
-from humangs_jax.body.model import (
-    EXACT,
-    BodyModel,
-    BodyPose,
-    SurfacePoints,
-    joint_transforms,
-    pose_features,
-    pose_points,
-    shaped,
-)
+from humangs_jax.body.model import EXACT, BodyModel, BodyPose, SurfacePoints, joint_transforms, pose_features, pose_points, shaped
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field

@@ -58,10 +58,7 @@ def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def joint_transforms(
-    rest_joints: Float[Array, "j 3"],
-    parents: tuple[int, ...],
-    rotations: Float[Array, "j 3"],
-    translation: Float[Array, "3"],
+    rest_joints: Float[Array, "j 3"], parents: tuple[int, ...], rotations: Float[Array, "j 3"], translation: Float[Array, "3"]
 ) -> Float[Array, "j 4 4"]:
     """G_j of every joint.
 
@@ -157,10 +154,7 @@ def shaped(mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: 
 
 
 def pose_points(
-    points: SurfacePoints,
-    betas: Float[Array, " s_used"],
-    features: Float[Array, " q"] | None,
-    transforms: Float[Array, "j 4 4"],
+    points: SurfacePoints, betas: Float[Array, " s_used"], features: Float[Array, " q"] | None, transforms: Float[Array, "j 4 4"]
 ) -> Float[Array, "p 3"]:
     """Where the points of a person are, metres. features: of the pose; ignored by bodies without correctives."""
     rest = shaped(points.rest, points.directions, betas)

@@ -42,12 +42,7 @@ GROUPS = {
     },
     "Look at it": {"animate": "animate.Animate", "render": "animate.Render", "view": "animate.View"},
     "Take it along": {"export": "avatars.Export"},
-    "Prepare photos": {
-        "detect": "captures.Detect",
-        "import": "captures.ImportCameras",
-        "fit": "fit.Fit",
-        "check": "fit.Check",
-    },
+    "Prepare photos": {"detect": "captures.Detect", "import": "captures.ImportCameras", "fit": "fit.Fit", "check": "fit.Check"},
     "Research": {
         "evaluate": "evaluate.Evaluate",
         "synth": "captures.Synth",

@@ -214,10 +214,7 @@ class View:
     docs: viewer.
     """
 
-    examples: ClassVar[tuple[str, ...]] = (
-        "humangs view avatar.npz --motion dance.bvh",
-        "humangs view runs/train --live",
-    )
+    examples: ClassVar[tuple[str, ...]] = ("humangs view avatar.npz --motion dance.bvh", "humangs view runs/train --live")
     avatar: Positional[Path]
     """File written by `humangs reconstruct`. With --live: of `humangs refine --live`, or the folder of a training run."""
     motion: Path | None = None

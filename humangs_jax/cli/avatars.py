@@ -47,10 +47,7 @@ class Demo:
     interruption.
     """
 
-    examples: ClassVar[tuple[str, ...]] = (
-        "humangs demo --out demo_out",
-        "humangs demo --refine 0 --preset realtime",
-    )
+    examples: ClassVar[tuple[str, ...]] = ("humangs demo --out demo_out", "humangs demo --refine 0 --preset realtime")
     out: Annotated[Path, Place()] = Path("demo_out")
     """Folder for the images, the video, the avatar and report.json."""
     weights: Path | None = None

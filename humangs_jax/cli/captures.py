@@ -50,10 +50,7 @@ class Detect:
     people.png shows everybody with a number. Needs `pip install 'humangs_jax[photos]'`. docs: your_photos.
     """
 
-    examples: ClassVar[tuple[str, ...]] = (
-        "humangs detect photos --out found",
-        "humangs detect photos --person 1 --out found",
-    )
+    examples: ClassVar[tuple[str, ...]] = ("humangs detect photos --out found", "humangs detect photos --person 1 --out found")
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
     out: Annotated[Path, Place()]

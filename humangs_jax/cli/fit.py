@@ -252,10 +252,7 @@ class Check:
     For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """
 
-    examples: ClassVar[tuple[str, ...]] = (
-        "humangs check me --out check.png",
-        "humangs check me --ranges",
-    )
+    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png", "humangs check me --ranges")
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]

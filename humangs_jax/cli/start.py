@@ -211,13 +211,7 @@ class Start:
 
             assert material.cameras is not None
             report = import_cameras(
-                material.cameras,
-                material.images,
-                self.out,
-                masks=material.masks,
-                scale=self.scale,
-                up=self.up,
-                overwrite=True,
+                material.cameras, material.images, self.out, masks=material.masks, scale=self.scale, up=self.up, overwrite=True
             )
         write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
         tell(report)

@@ -102,11 +102,7 @@ T = TypeVar("T")
 
 
 def in_processes(
-    work: Callable[..., T],
-    tasks: Mapping[K, tuple[Any, ...]],
-    workers: int,
-    prepare: Callable[..., object],
-    *given: Any,
+    work: Callable[..., T], tasks: Mapping[K, tuple[Any, ...]], workers: int, prepare: Callable[..., object], *given: Any
 ) -> Iterator[tuple[K, T]]:
     """Yields (name, work(*arguments)) of tasks by name, as they end, from several processes of one thread each, on the CPU.
 

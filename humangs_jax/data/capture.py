@@ -262,12 +262,7 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
 
 
 def _assemble(
-    photos: Photos,
-    body: BodyModel,
-    betas: np.ndarray,
-    rotations: np.ndarray,
-    translations: np.ndarray,
-    body_file: str | Path,
+    photos: Photos, body: BodyModel, betas: np.ndarray, rotations: np.ndarray, translations: np.ndarray, body_file: str | Path
 ) -> Capture:
     return Capture(
         **vars(photos),

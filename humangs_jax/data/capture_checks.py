@@ -62,13 +62,7 @@ def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "
     return mapping[key]
 
 
-KINDS: dict[type, str] = {
-    dict: "a JSON object",
-    list: "a list",
-    str: "a name or path",
-    int: "an integer",
-    float: "a number",
-}
+KINDS: dict[type, str] = {dict: "a JSON object", list: "a list", str: "a name or path", int: "an integer", float: "a number"}
 """Of JSON values, in words."""
 
 
@@ -136,12 +130,7 @@ def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
 
 
 def body_parameters(
-    body: BodyModel,
-    betas: Any,
-    rotations: Any,
-    translations: Any,
-    file: object,
-    shape_names: Sequence[str] | None = None,
+    body: BodyModel, betas: Any, rotations: Any, translations: Any, file: object, shape_names: Sequence[str] | None = None
 ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
     """betas, rotations and translations in float32, of the sizes that the body has. shape_names: see `shape_coefficients`."""
     joints = len(body.parents)

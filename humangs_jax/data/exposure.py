@@ -121,12 +121,7 @@ def multiplied(
 
 @jax.jit
 def seen_colors(
-    body: BodyModel,
-    rest: RestBody,
-    pose: BodyPose,
-    image: Float[Array, "h w 3"],
-    mask: Float[Array, "h w"],
-    camera: Camera,
+    body: BodyModel, rest: RestBody, pose: BodyPose, image: Float[Array, "h w 3"], mask: Float[Array, "h w"], camera: Camera
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
     """Of one photo the colors of the body's vertices, and which of them it shows."""
     vertices = pose_body(body, rest, pose).vertices

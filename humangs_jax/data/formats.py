@@ -154,16 +154,10 @@ KEYPOINTS = SourceFormats(
         content="33 points of BlazePose; `save_keypoints` (.npz): any set",
     ),
     openpose=SourceFormat(
-        "OpenPose",
-        _KEYPOINTS + "openpose:read",
-        files=("openpose",),
-        content="`--write_json`, a file an image: BODY_25, hands",
+        "OpenPose", _KEYPOINTS + "openpose:read", files=("openpose",), content="`--write_json`, a file an image: BODY_25, hands"
     ),
     easymocap=SourceFormat(
-        "EasyMocap",
-        _KEYPOINTS + "easymocap:read",
-        files=("annots",),
-        content="`annots`, a file an image: BODY_25, hands",
+        "EasyMocap", _KEYPOINTS + "easymocap:read", files=("annots",), content="`annots`, a file an image: BODY_25, hands"
     ),
     coco=SourceFormat(
         "COCO, COCO-WholeBody or AlphaPose",
@@ -241,10 +235,7 @@ def _arrays(about: str, keys: str, poses: str, use: dict[str, Any] | None = None
 
 _FACE = "jaw=jaw_pose left_eye=leye_pose right_eye=reye_pose "
 _PARTS = f"root=global_orient limbs=body_pose {_FACE}left_hand=left_hand_pose right_hand=right_hand_pose"
-_OF_CAMERA = (
-    *("trans", "transl", "cam_t", "pred_cam_t_full", "pred_cam_t"),
-    *("camera", "cam_trans", "translation", "orig_cam"),
-)
+_OF_CAMERA = (*("trans", "transl", "cam_t", "pred_cam_t_full", "pred_cam_t"), *("camera", "cam_trans", "translation", "orig_cam"))
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
 """Estimators write what they find in a world, or in the coordinates of a camera, whose y points down."""
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
@@ -258,10 +249,7 @@ MOTIONS = Formats(
     tram=_arrays("TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}),
     human3r=_arrays("Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}),
     sam3d=_arrays(
-        "SAM 3D Body",
-        "pred_joint_coords",
-        "all=pred_joint_coords",
-        use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"},
+        "SAM 3D Body", "pred_joint_coords", "all=pred_joint_coords", use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"}
     ),
     smplcodec=_arrays(
         *("smplcodec", "bodyPose", "body=bodyPose face=headPose left_hand=leftHandPose right_hand=rightHandPose"),

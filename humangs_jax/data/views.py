@@ -118,12 +118,7 @@ class _ByContent:
 
 @functools.lru_cache(maxsize=4)
 def _remeshed(
-    key: _ByContent,
-    vertices: int | None,
-    edge: float | int | None,
-    fewer: int | None,
-    longest: float | int | None,
-    wanted: Any,
+    key: _ByContent, vertices: int | None, edge: float | int | None, fewer: int | None, longest: float | int | None, wanted: Any
 ) -> BodyModel:
     body = key.body
     if vertices is not None and vertices < len(body.template):

@@ -176,11 +176,7 @@ COARSE = 30.0
 
 
 def _rigid_starts(
-    problem: KeypointProblem,
-    observations: Observations,
-    points: Float[Array, "k 3"],
-    counts: Float[Array, " k"],
-    kept: int,
+    problem: KeypointProblem, observations: Observations, points: Float[Array, "k 3"], counts: Float[Array, " k"], kept: int
 ) -> FitState:
     """The `kept` best positions and orientations of a resting body, a batch.
 

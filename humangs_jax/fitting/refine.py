@@ -32,13 +32,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, how_far, limit_violations
-from humangs_jax.fitting.residuals.keypoints import (
-    NEAR,
-    Observations,
-    found_noise,
-    keypoint_residuals,
-    scaled_observations,
-)
+from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, found_noise, keypoint_residuals, scaled_observations
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
     Boundary,
@@ -361,11 +355,7 @@ def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPo
 
 @jax.jit
 def _keypoint_errors(
-    model: LandmarkModel,
-    betas: Float[Array, " s"],
-    poses: BodyPose,
-    seen: Observations,
-    frames: Int[np.ndarray | Array, " v"],
+    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, seen: Observations, frames: Int[np.ndarray | Array, " v"]
 ) -> Float[Array, "v c k"]:
     """(v, 1, k) pixels."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)

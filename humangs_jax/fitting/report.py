@@ -238,10 +238,7 @@ def undetermined_joints(
 
 
 def keypoint_warnings(
-    views: Sequence[ViewReport],
-    expected: Float[np.ndarray, " m"],
-    violations: Sequence[Violation],
-    swaps: Sequence[Swap],
+    views: Sequence[ViewReport], expected: Float[np.ndarray, " m"], violations: Sequence[Violation], swaps: Sequence[Swap]
 ) -> tuple[str, ...]:
     """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
     found = [str(swap) for swap in swaps[:NAMED]]

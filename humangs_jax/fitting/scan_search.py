@@ -82,12 +82,7 @@ LOOSE = 0.01
 
 
 def run_iterations(
-    problem: ScanProblem,
-    target: Target,
-    given: Given,
-    tolerances: Tolerances,
-    state: FitState,
-    iterations: tuple[Round, ...],
+    problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState, iterations: tuple[Round, ...]
 ) -> tuple[FitState, list[Outcome]]:
     """The body after some iterations, and what the solver did in each."""
     outcomes = []
@@ -101,12 +96,7 @@ def run_iterations(
 
 @functools.partial(jax.jit, static_argnames="steps")
 def improve(
-    problem: ScanProblem,
-    matches: ScanMatches,
-    given: Given,
-    tolerances: Tolerances,
-    state: FitState,
-    steps: int = STEPS,
+    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int = STEPS
 ) -> tuple[FitState, Outcome]:
     """The body after at most `steps` steps of the solver with these pairs, and what the solver did."""
     return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
@@ -177,10 +167,7 @@ class Start:
 
 
 def start_from_landmarks(
-    surface: BodySurface,
-    resting: Float[np.ndarray, "k 3"],
-    points: Float[np.ndarray, "k 3"],
-    known: Float[np.ndarray, " k"],
+    surface: BodySurface, resting: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Float[np.ndarray, " k"]
 ) -> Start:
     """The start from given landmarks.
 

@@ -66,12 +66,7 @@ def solve(
 
 
 def _solve(
-    residuals: Callable[[T], PyTree],
-    start: T,
-    steps: int,
-    method: Literal["lbfgs", "lm"],
-    tolerance: float,
-    free: T | None,
+    residuals: Callable[[T], PyTree], start: T, steps: int, method: Literal["lbfgs", "lm"], tolerance: float, free: T | None
 ) -> tuple[T, Outcome]:
     import lineax
     import optimistix

@@ -238,15 +238,7 @@ def zero_state(origin: Origin) -> FitState:
 def frame_axes(state: FitState) -> FitState:
     """`in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
     return replace(
-        state,
-        betas=None,
-        global_orient=0,
-        transl=0,
-        body_pose=0,
-        cameras=None,
-        clothing=None,
-        log_scale=None,
-        places=None,
+        state, betas=None, global_orient=0, transl=0, body_pose=0, cameras=None, clothing=None, log_scale=None, places=None
     )
 
 

@@ -40,9 +40,7 @@ def triangulate(
     return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
 
 
-def triangulate_robustly(
-    observations: Observations,
-) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
+def triangulate_robustly(observations: Observations) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
     """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
 
     Every pair of views proposes a point; the proposal that the views agree with most is improved from those views alone. A

@@ -146,11 +146,7 @@ class ArrayFile:
     """Named arrays of a file. error: the class of what is raised for a value that is not what it should be."""
 
     def __init__(
-        self,
-        path: str | Path,
-        values: Mapping[str, Any],
-        pickled: tuple[str, ...] = (),
-        error: type[FileError] = FileError,
+        self, path: str | Path, values: Mapping[str, Any], pickled: tuple[str, ...] = (), error: type[FileError] = FileError
     ) -> None:
         self.path, self.values, self.pickled, self.error = Path(path), values, pickled, error
 

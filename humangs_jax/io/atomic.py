@@ -146,10 +146,7 @@ def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
 
 
 def check_replaceable(
-    folder: str | os.PathLike,
-    overwrite: bool = True,
-    mark: str | None = None,
-    inputs: Iterable[str | os.PathLike | None] = (),
+    folder: str | os.PathLike, overwrite: bool = True, mark: str | None = None, inputs: Iterable[str | os.PathLike | None] = ()
 ) -> None:
     """Whether a folder can be replaced, to be asked before the work begins.
 

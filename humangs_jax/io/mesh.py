@@ -20,17 +20,7 @@ import numpy as np
 
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import image_in
-from humangs_jax.io.reading import (
-    FileError,
-    Refused,
-    check_limit,
-    check_unpacked,
-    inside,
-    parse_json,
-    read_bytes,
-    reading,
-    shown,
-)
+from humangs_jax.io.reading import FileError, Refused, check_limit, check_unpacked, inside, parse_json, read_bytes, reading, shown
 
 GLB_START, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -154,11 +144,7 @@ class GlbWriter:
         """Write the file with a glTF document to which arrays, buffer and `asset` are added. It appears whole or not at all."""
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document
-        document |= {
-            "accessors": self.accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": len(self.data)}],
-        }
+        document |= {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.data)}]}
         text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()  # JSON has no NaN
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), JSON_CHUNK) + text

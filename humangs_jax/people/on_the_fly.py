@@ -225,12 +225,7 @@ def _box_average(samples: Float[Array, "samples c"], camera: Camera, s: int) -> 
 
 
 def _light_pixels(
-    bank: PeopleBank,
-    scene: Scene,
-    corners: Float[Array, "f 15"],
-    behind: Bool[Array, " f"],
-    fragments: Fragments,
-    step: int,
+    bank: PeopleBank, scene: Scene, corners: Float[Array, "f 15"], behind: Bool[Array, " f"], fragments: Fragments, step: int
 ) -> Float[Array, "hw 3"]:
     """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at a time."""
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)

@@ -13,17 +13,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import anatomy as kin
-from humangs_jax.people.poses import (
-    ARMS,
-    STANCES,
-    Stance,
-    arm_clearance,
-    bend_arm,
-    bend_trunk,
-    draw_goal,
-    in_world,
-    pose_hand,
-)
+from humangs_jax.people.poses import ARMS, STANCES, Stance, arm_clearance, bend_arm, bend_trunk, draw_goal, in_world, pose_hand
 from humangs_jax.people.surfaces import choice
 
 FPS, LONG_STEP = 30.0, 0.75
@@ -175,11 +165,7 @@ def _footprint(build: kin.Build, gait: Gait, heading: Heading, track: Track, sid
 
 
 def _swing_arms(
-    rng: np.random.Generator,
-    build: kin.Build,
-    rotations: Float[np.ndarray, "m j 3"],
-    phase: Float[np.ndarray, " m"],
-    gait: Gait,
+    rng: np.random.Generator, build: kin.Build, rotations: Float[np.ndarray, "m j 3"], phase: Float[np.ndarray, " m"], gait: Gait
 ) -> None:
     """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of the shoulders."""
     stood = rotations[0].copy()

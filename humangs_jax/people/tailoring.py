@@ -254,13 +254,7 @@ def _fold_heights(rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm
 
 
 def _push(
-    points: Points,
-    across: tuple[int, int],
-    along: Field,
-    boundary: Boundaries,
-    amount: Field,
-    ease: float,
-    extra: Field,
+    points: Points, across: tuple[int, int], along: Field, boundary: Boundaries, amount: Field, ease: float, extra: Field
 ) -> Points:
     """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,) on it; across: other axes."""
     center, axes = boundary.center(along), list(across)

@@ -25,16 +25,7 @@ from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.capture_checks import checked_json
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.data.sets import (
-    DATA_SET,
-    MANIFEST,
-    SYNTHETIC,
-    begin_set,
-    finished,
-    made,
-    read_manifest,
-    write_manifest,
-)
+from humangs_jax.data.sets import DATA_SET, MANIFEST, SYNTHETIC, begin_set, finished, made, read_manifest, write_manifest
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan

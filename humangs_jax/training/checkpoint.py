@@ -51,11 +51,7 @@ class Checkpoints:
         self._ocp = ocp
         kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            best_fn=score,
-            preservation_policy=kept,
-            enable_async_checkpointing=True,
-            create=not read_only,
-            read_only=read_only,
+            best_fn=score, preservation_policy=kept, enable_async_checkpointing=True, create=not read_only, read_only=read_only
         )
         folder, self._read_only = Path(folder).resolve(), read_only
         if unreadable := _without_score(folder):

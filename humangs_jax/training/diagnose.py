@@ -252,13 +252,7 @@ class Recorder:
 
 @functools.partial(jax.jit, static_argnames="config")
 def observe_subject(
-    params: PyTree,
-    batch_stats: PyTree,
-    body: BodyModel,
-    example: Example,
-    key: Key,
-    config: TrainConfig,
-    networks: LossNetworks,
+    params: PyTree, batch_stats: PyTree, body: BodyModel, example: Example, key: Key, config: TrainConfig, networks: LossNetworks
 ) -> tuple[Scalar, list[StageReport]]:
     """The loss (`subject_loss`), and all its stages in the order in which they end.
 

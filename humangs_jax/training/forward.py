@@ -179,11 +179,7 @@ def evaluate(
 
 
 def validate(
-    variables: Variables,
-    body: BodyModel,
-    examples: Sequence[Example],
-    config: TrainConfig,
-    networks: LossNetworks = NO_NETWORKS,
+    variables: Variables, body: BodyModel, examples: Sequence[Example], config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[dict[str, float], list[np.ndarray]]:
     """Means over the examples of all processes, and the images of this process's. All arguments are local arrays."""
     # buffers of another size than in training: as many pairs as the larger images may need

@@ -65,11 +65,7 @@ class LiveView:
 
 
 def follow(
-    path: str | Path,
-    capture: str | Path | None = None,
-    motion: Motion | None = None,
-    port: int = 0,
-    open_browser: bool = True,
+    path: str | Path, capture: str | Path | None = None, motion: Motion | None = None, port: int = 0, open_browser: bool = True
 ) -> None:
     """Show what a training run or a refinement makes, until Ctrl-C.
 

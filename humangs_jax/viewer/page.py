@@ -256,11 +256,7 @@ def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar
 
 @checked_arguments
 def write_page(
-    path: str | os.PathLike,
-    avatar: Avatar,
-    motion: Motion | None = None,
-    title: str = "avatar",
-    motion_name: str | None = None,
+    path: str | os.PathLike, avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None
 ) -> int:
     """Write the page; it appears whole or not at all. Returns its size in bytes. Raises: as `page_html`; OSError."""
     text = page_html(avatar, motion, title, motion_name)

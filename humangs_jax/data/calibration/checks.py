@@ -97,9 +97,7 @@ def mean_reprojection_error(calibration: Calibration) -> float | None:
     return float(np.concatenate(errors).mean())
 
 
-def axes_meeting(
-    poses: Float[np.ndarray, "v 4 4"],
-) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
+def axes_meeting(poses: Float[np.ndarray, "v 4 4"]) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
     """Depth of the point nearest to all optical axes before each camera, and its distance from each axis.
 
     (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in any unit.

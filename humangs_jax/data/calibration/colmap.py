@@ -173,10 +173,7 @@ def _binary_cameras(file: Path) -> dict[str, CalibratedCamera]:
             supported = f"expected one of {', '.join(models)}; else {UNDISTORT_BEFORE}"
             raise CaptureError(file, f"camera {i}", f"camera model {model}: {supported}")
         values = floats(
-            list(data.read("d" * len(PARAMETERS[models[model]]))),
-            file,
-            f"camera {i}",
-            (len(PARAMETERS[models[model]]),),
+            list(data.read("d" * len(PARAMETERS[models[model]]))), file, f"camera {i}", (len(PARAMETERS[models[model]]),)
         )
         lenses[str(camera_id)] = _lens(models[model], (float(width), float(height)), values.tolist(), file, f"camera {i}")
     return lenses

@@ -216,10 +216,7 @@ def _named_masks(calibration: Calibration, photos: Sequence[Photo], masks: Path 
 def _check_options(scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
     if not 0 < scale < float("inf"):
         raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
-    for name, word, known in (
-        ("up", up, tuple(ROTATION_TO_Y_UP)),
-        ("pixel_centers", pixel_centers, get_args(PixelCenters)),
-    ):
+    for name, word, known in (("up", up, tuple(ROTATION_TO_Y_UP)), ("pixel_centers", pixel_centers, get_args(PixelCenters))):
         if word is not None and word not in known:
             raise ArgumentError(name, f"{word}: expected one of {', '.join(known)}")
     for name, value in (("every", every), ("frames", frames)):
@@ -334,13 +331,7 @@ def _is_transparent(photo: Path) -> bool:
 
 
 def _rewrite(
-    folder: Path,
-    photo: Photo,
-    turn: Turn,
-    name: str,
-    camera: CalibratedCamera,
-    transparent: bool,
-    canvas: tuple[int, int],
+    folder: Path, photo: Photo, turn: Turn, name: str, camera: CalibratedCamera, transparent: bool, canvas: tuple[int, int]
 ) -> tuple[dict[str, str], bool]:
     """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it does not see are white and
     background.

@@ -11,14 +11,7 @@ from humangs_jax.data.capture_checks import CaptureError, expect
 from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import Refused, check_limit, check_nesting
 
-KEYS = {
-    "matrix": "K",
-    "rotation": "R",
-    "translation": "T",
-    "distortions": "dist",
-    "size": "imgSize",
-    "fisheye": "fisheye",
-}
+KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}
 """Names in the tables, and those of OpenCV's files."""
 
 

@@ -19,14 +19,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
-from humangs_jax.data.datasets.bodies import (
-    BodyParameters,
-    FileBody,
-    checked_numbers,
-    open_arrays,
-    recover_pose,
-    recover_shape,
-)
+from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, checked_numbers, open_arrays, recover_pose, recover_shape
 from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size, read_grey, read_image

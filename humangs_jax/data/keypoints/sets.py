@@ -101,8 +101,7 @@ COCO_17 = _keypoint_set("coco17", _COCO)
 """COCO's 17 body points."""
 
 COCO_WHOLEBODY_133 = _keypoint_set(
-    "wholebody133",
-    (*_COCO, *_FEET, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right")),
+    "wholebody133", (*_COCO, *_FEET, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
 )
 """COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
 
@@ -112,8 +111,7 @@ HALPE_26 = _keypoint_set(
 """Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
 
 HALPE_136 = _keypoint_set(
-    "halpe136",
-    (*HALPE_26.names, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right")),
+    "halpe136", (*HALPE_26.names, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
 )
 """Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
 

@@ -253,11 +253,7 @@ class CaptureCache(PeopleCache):
     """
 
     def __init__(
-        self,
-        folders: Sequence[str | Path],
-        body: BodyModel,
-        limit_bytes: int = 4 << 30,
-        body_file: str | Path = DEFAULT_BODY,
+        self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30, body_file: str | Path = DEFAULT_BODY
     ):
         self.folders = tuple(Path(folder) for folder in folders)
         super().__init__([CaptureFolder(folder, body, body_file) for folder in self.folders], limit_bytes)

@@ -172,11 +172,7 @@ def subject_views(subject: StoredSubject, indices: Sequence[int], size: int, dep
         images=shrink(subject.images[chosen], size),
         masks=shrink(subject.masks[chosen], size),
         cameras=_on_host(
-            Camera,
-            K=subject.K[chosen] * scale[:, None],
-            cam_from_world=subject.cam_from_world[chosen],
-            width=size,
-            height=size,
+            Camera, K=subject.K[chosen] * scale[:, None], cam_from_world=subject.cam_from_world[chosen], width=size, height=size
         ),
         rotations=subject.rotations[frames],
         translations=subject.translations[frames],

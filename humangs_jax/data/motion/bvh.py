@@ -116,10 +116,7 @@ def _chained(parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]) -> Flo
 
 
 def _posed(
-    parents: tuple[int, ...],
-    offsets: Float[np.ndarray, "s 3"],
-    channels: list[list[str]],
-    numbers: Float[np.ndarray, "m n"],
+    parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"], channels: list[list[str]], numbers: Float[np.ndarray, "m n"]
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
     """Rotations (m, s, 3, 3) and places (m, s, 3) of all joints in the world."""
     frames = len(numbers)

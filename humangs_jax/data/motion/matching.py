@@ -10,18 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion.rules import (
-    ENDS,
-    EXPECTED_NAMES,
-    FEW,
-    LIKE,
-    MIDDLE,
-    NEEDED,
-    NOISE,
-    SIDED,
-    SIDES,
-    UNDER,
-)
+from humangs_jax.data.motion.rules import ENDS, EXPECTED_NAMES, FEW, LIKE, MIDDLE, NEEDED, NOISE, SIDED, SIDES, UNDER
 from humangs_jax.geometry.mesh import unit
 from humangs_jax.io.reading import Refused
 

@@ -17,15 +17,7 @@ from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, r
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 
-INSIDE = (
-    "smpl_params_global",
-    "smplx_world",
-    "smpl_params_incam",
-    "smplx_cam",
-    "pred_smpl_params",
-    "smpl_params",
-    "smpl",
-)
+INSIDE = ("smpl_params_global", "smplx_world", "smpl_params_incam", "smplx_cam", "pred_smpl_params", "smpl_params", "smpl")
 """Keys of what was found of a person, the best first."""
 LISTS = ("people", "persons", "annots", "results")
 """Keys of all people."""

@@ -22,12 +22,7 @@ from humangs_jax.geometry import quaternion
 
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
 HAND_NUMBERS = 45
-COLUMNS = {
-    3 * len(JOINT_NAMES): "SMPL-X",
-    BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H",
-    72: "SMPL",
-    BODY_NUMBERS: "the body",
-}
+COLUMNS = {3 * len(JOINT_NAMES): "SMPL-X", BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H", 72: "SMPL", BODY_NUMBERS: "the body"}
 """Numbers of a pose, by whose joints they are."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
@@ -215,10 +210,7 @@ def up_axis(
         return stands, f"{stands} is up, not {usual}: people stand along it"
     if contradicted or _opposite(stands, usual):
         return usual, ""
-    return (
-        usual,
-        f"{usual} is up, as usual in such files, and people lie along {stands}; if they should stand: up={stands}",
-    )
+    return (usual, f"{usual} is up, as usual in such files, and people lie along {stands}; if they should stand: up={stands}")
 
 
 def _floors(points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int) -> list[float]:

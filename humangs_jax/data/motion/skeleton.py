@@ -106,8 +106,7 @@ def retargeted(
     turns, places = turn @ clip.turns, clip.places @ turn.T
     world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
     rotations = np.stack(
-        [_rotation(own if p < 0 else _transposed(world[p]) @ own) for p, own in zip(PARENTS, world, strict=True)],
-        axis=1,
+        [_rotation(own if p < 0 else _transposed(world[p]) @ own) for p, own in zip(PARENTS, world, strict=True)], axis=1
     )
     moves = scale * places[:, source["pelvis"]]
     soles = _soles(clip, source, joints) if standing else None
@@ -283,10 +282,7 @@ def _steps(heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, f
 
 
 def _steps_of_body(
-    world: Sequence[Float[np.ndarray, "m 3 3"]],
-    joints: Float[np.ndarray, "j 3"],
-    moves: Float[np.ndarray, "m 3"],
-    source: Source,
+    world: Sequence[Float[np.ndarray, "m 3 3"]], joints: Float[np.ndarray, "j 3"], moves: Float[np.ndarray, "m 3"], source: Source
 ) -> Float[np.ndarray, " m"]:
     """(m,) the same of our body, above a floor at the height of its lowest joint in T-pose."""
     places = {0: moves}
