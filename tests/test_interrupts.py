@@ -39,11 +39,11 @@ def command(work, more=""):
     return f"{START}\n{textwrap.dedent(more)}\n{run}cli._parsed = lambda arguments: Own()\ncli.main()"
 
 
-def interrupted(program):
+def interrupted(program, number=signal.SIGINT):
     """stdout and stderr of a process that is interrupted when it has begun."""
     assert program.stdout.readline() == "begun\n"
     time.sleep(0.5)  # now it is in there
-    program.send_signal(signal.SIGINT)
+    program.send_signal(number)
     return program.communicate(timeout=250)
 
 
@@ -64,6 +64,22 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     _, error = interrupted(program)
     assert program.returncode == cli.INTERRUPTED and error.endswith("humangs: interrupted\n")
     assert PATIENCE <= time.monotonic() - began < 50
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_what_is_asked_to_end_tidies_up(name, tmp_path):
+    """As by `timeout`, or with its terminal: the lock of a place goes, too."""
+    work = """
+        import time
+        from humangs_jax.io import atomic
+        with atomic.only_writer("me", replaced=True):
+            print("begun", flush=True)
+            time.sleep(300)
+    """
+    program = process(command(work), tmp_path)
+    _, error = interrupted(program, getattr(signal, name))
+    assert program.returncode == cli.INTERRUPTED and error.endswith("humangs: interrupted\n"), error
     assert not list(tmp_path.iterdir())
 
 

@@ -322,7 +322,7 @@ class Export:
     html: Annotated[Path | None, Place((".html",))] = None
     """The HTML viewer to write: one file that needs no network (docs: viewer)."""
     mesh: bool = False
-    """The body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
+    """Write the body, not the Gaussians: a .glb then holds its skin, and --motion as animation."""
     motion: Path | None = None
     """The motion that the viewer plays (default: the shipped walk) or that poses --out (default: T-pose). docs: motions."""
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
@@ -389,7 +389,8 @@ class Export:
         what = f"{len(avatar.faces):,} triangles" if form.mesh else f"{len(avatar.gaussians.means):,} Gaussians"
         poses = f", {len(motion.translations)} frames" if motion is not None and form.animated else ""
         written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
-        wrote(written, f"{what}{poses}, feet on 0")
+        beside = f"; {' and '.join(out.with_suffix(suffix).name for suffix in form.beside)} belong to it" if form.beside else ""
+        wrote(written, f"{what}{poses}, feet on 0{beside}")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
         """The frames asked for, and their numbers where there are many."""

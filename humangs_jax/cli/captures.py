@@ -23,6 +23,13 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
         warn(line)
 
 
+def keypoints_wanted() -> tuple[str, ...]:
+    """What `humangs fit` has to be told: nothing where it finds keypoints itself."""
+    from humangs_jax.detection.blazepose import available
+
+    return () if available() else ("--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",)
+
+
 def found_here(capture: Path, person: int | None) -> Path:
     """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints, and masks if there are none.
 
@@ -123,7 +130,7 @@ class ImportCameras:
         with stage("importing"):
             report = import_cameras(**options, frames=self.max_frames)
         tell(report)
-        suggest("humangs fit", self.out, "--keypoints FILE")
+        suggest("humangs fit", self.out, *keypoints_wanted())
 
 
 FOR_TRAINING = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
@@ -162,10 +169,10 @@ class Synth:
     """Number of the first subject within the split."""
     size: int = 512
     """Side of the photos in pixels: 128, 256, 512 (a set of 512 can be read at all three)."""
-    views: Annotated[int, at_least(1)] = 60
-    """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away."""
-    close_views: Annotated[int, at_least(0)] = 12
-    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person."""
+    views: Annotated[int | None, at_least(1)] = None
+    """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away. Default: 60."""
+    close_views: Annotated[int | None, at_least(0)] = None
+    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person. Default: 12, or 0 with --views."""
     poses: Annotated[int, at_least(1)] = 1
     """Poses per subject."""
     sequences: bool = False
@@ -195,8 +202,8 @@ class Synth:
         layout = Layout(
             small.get("size", self.size),
             small.get("poses", self.poses),
-            small.get("views", self.views),
-            small.get("close_views", self.close_views),
+            small.get("views", self.views or 60),
+            small.get("close_views", (12 if self.views is None else 0) if self.close_views is None else self.close_views),
             extras.held_out,
             frames=self.motion_frames if self.sequences else 0,
             scan_texture=2048 if extras.scans else 0,

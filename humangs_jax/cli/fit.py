@@ -213,6 +213,7 @@ class Fit:
         if self.out is None and not only_views:
             raise UsageError("--out FOLDER is missing: where the body of the scan goes")
         with stage("starting"):
+            from humangs_jax.apps.detect import KEYPOINTS_FILE
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
@@ -225,8 +226,11 @@ class Fit:
             assert scan.scan_views is not None
             with stage("rendering the scan"):
                 render_scan_views(scan.scan, scan.scan_views)
-            wrote(scan.scan_views, f"images of the scan; find keypoints in {scan.scan_views / 'images'}, then")
-            suggest("humangs fit --scan", scan.scan, "--scan-views", scan.scan_views, "--keypoints FILE --out FOLDER")
+            images, found = scan.scan_views / "images", scan.scan_views / "found"
+            wrote(scan.scan_views, f"images of the scan; find keypoints in {images}, as the first of these commands does")
+            suggest("humangs detect", images, "--out", found)
+            keypoints = found / KEYPOINTS_FILE
+            suggest("humangs fit --scan", scan.scan, "--scan-views", scan.scan_views, "--keypoints", keypoints, "--out FOLDER")
             return
         assert self.out is not None
         check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.scan_views, keypoints, self.body))

@@ -39,7 +39,8 @@ PATIENCE = 2.0
 def end_within_seconds() -> None:
     """From now on Ctrl-C ends this process by a KeyboardInterrupt or, if that is not heard in time, at once.
 
-    For the console script. Where a command handles the signal itself, as training does to save its state, nothing is forced.
+    For the console script. So does what asks a process to end (`timeout`, a terminal that is closed). Where a command handles the
+    signal itself, as training does to save its state, nothing is forced.
     """
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
@@ -54,15 +55,23 @@ def end_within_seconds() -> None:
         heard.set()
         signal.default_int_handler(number, frame)
 
+    def end(number, frame):
+        """Heard by `watch`."""
+
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.signal(signal.SIGINT, interrupt)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # not below nohup
+            signal.signal(number, end)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     # when Python ends it gives signals back to the system, whose handler kills: a command that was done had no exit code
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch():
         while number := os.read(reader, 1):
+            if signal.getsignal(number[0]) is end:
+                os.kill(os.getpid(), signal.SIGINT)
             if number[0] != signal.SIGINT or signal.getsignal(signal.SIGINT) is not interrupt:
                 continue
             time.sleep(PATIENCE)

@@ -210,7 +210,7 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     export = ["humangs", "export", str(tmp_path / "me.npz"), "--out", str(tmp_path / "x.obj")]
     monkeypatch.setattr(sys, "argv", export)
     cli.main()
-    assert "1,280 triangles" in capsys.readouterr().out
+    assert "1,280 triangles, feet on 0; x.mtl and x.png belong to it" in capsys.readouterr().out
     assert {path.name for path in tmp_path.glob("x*")} == {"x.obj", "x.mtl", "x.png"}
     read = trimesh.load(tmp_path / "x.obj", process=False)
     low = float(np.asarray(one.rest_vertices)[:, 1].min())

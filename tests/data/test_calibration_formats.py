@@ -1,6 +1,7 @@
 """Each format, written the way its tool does from known cameras, is read back as these cameras."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,15 @@ def test_any_axis_can_be_up(tmp_path, up):
     np.testing.assert_allclose(relative(got), relative(true), atol=1e-9)
     other = "+z" if up != "+z" else "+y"
     report = import_cameras(source, images, tmp_path / "out", up=other, overwrite=True)
-    assert f"{up} fits best" in str(report)
+    assert f"--up={up} fits best" in str(report)
+
+
+def test_the_example_of_the_docs_is_a_calibration(tmp_path):
+    text = (Path(__file__).parents[2] / "docs/cameras.md").read_text()
+    (tmp_path / "calibration.json").write_text(re.search(r"```json\n(.*?)```", text, re.DOTALL)[1])
+    (camera,) = read_calibration(tmp_path / "calibration.json").cameras
+    assert camera.name == "front" and (camera.width, camera.height) == (1920, 1080) and camera.distortion is not None
+    np.testing.assert_array_equal(camera.cam_from_world[:3], [[1, 0, 0, 0], [0, 1, 0, 0.9], [0, 0, 1, 2.6]])
 
 
 def test_easymocap_with_three_decimals(tmp_path):

@@ -28,6 +28,8 @@ class ExportFormat(Format):
     """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path, gaussians, rest_fields)."""
     backwards: bool = False
     """Its axes are to the right, up and back: half a turn about y from ours."""
+    beside: tuple[str, ...] = ()
+    """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
     """Of Gaussians, called with the bytes of a file; raises `io.reading.Refused`."""
     magic: bytes = b""
@@ -52,10 +54,13 @@ EXPORTS = Formats(
         **{"reader": f"{HERE}.glb:read_glb", "magic": b"glTF"},
     ),
     mesh=ExportFormat(
-        *("the body as a textured mesh with skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),
+        *("with --mesh the body with texture, skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),
         **{"mesh": True, "animated": True},
     ),
-    obj=ExportFormat("the body as a textured mesh in a pose", f"{HERE}.mesh:write_poses", (".obj",), mesh=True),
+    obj=ExportFormat(
+        *("the body as a textured mesh in a pose", f"{HERE}.mesh:write_poses", (".obj",)),
+        **{"mesh": True, "beside": (".mtl", ".png")},
+    ),
 )
 """By name; a suffix has at most one format of Gaussians and one of meshes."""
 

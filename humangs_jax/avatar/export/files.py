@@ -1,5 +1,6 @@
 """An avatar to a file, or a motion to a sequence of files: the suffix decides the format."""
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +32,7 @@ def frame_range(text: str, count: int) -> range:
 
 
 def export(
-    path: Path,
+    path: str | os.PathLike,
     avatar: Avatar,
     motion: Motion | None = None,
     numbers: Sequence[int] | None = None,
@@ -55,7 +56,7 @@ def export(
         name: of the animation.
 
     Returns:
-        The files.
+        The files, without those that a format puts beside them (`.mtl` and `.png` of an `.obj`).
 
     Raises:
         ValueError: for another suffix, a format without what is asked for, or if `numbers` are not one for each frame.
@@ -63,6 +64,7 @@ def export(
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)
     """
+    path = Path(path)
     form = chosen_format(path.suffix, mesh)
     if form is None:
         known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes

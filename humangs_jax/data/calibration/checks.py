@@ -143,7 +143,7 @@ def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
         return []
     in_source = np.asarray(ROTATION_TO_Y_UP[up]).T @ direction
     best = max(ROTATION_TO_Y_UP, key=lambda axis: float(f"{axis[0]}1") * in_source["xyz".index(axis[1])])
-    return [f"the photos do not stand upright with {up} up: {best} fits best (or were they taken sideways?)"]
+    return [f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken sideways?)"]
 
 
 def _center_warnings(camera: CalibratedCamera) -> list[str]:
