@@ -114,7 +114,7 @@ def test_any_axis_can_be_up(tmp_path, up):
 def test_the_example_of_the_docs_is_a_calibration(tmp_path):
     text = (Path(__file__).parents[2] / "docs/cameras.md").read_text()
     (tmp_path / "calibration.json").write_text(re.search(r"```json\n(.*?)```", text, re.DOTALL)[1])
-    (camera,) = read_calibration(tmp_path / "calibration.json").cameras
+    (camera,) = read_calibration(tmp_path / "calibration.json", lambda _: (1920, 1080)).cameras
     assert camera.name == "front" and (camera.width, camera.height) == (1920, 1080) and camera.distortion is not None
     np.testing.assert_array_equal(camera.cam_from_world[:3], [[1, 0, 0, 0], [0, 1, 0, 0.9], [0, 0, 1, 2.6]])
 
