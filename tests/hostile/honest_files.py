@@ -6,6 +6,7 @@ import json
 import struct
 
 import bvh_files
+import calibration_files
 import dataset_files
 import jax
 import numpy as np
@@ -149,9 +150,7 @@ def opencv_yaml():
 
 
 def write_easymocap(folder):
-    text = opencv_yaml()
-    (folder / "intri.yml").write_text(text)
-    (folder / "extri.yml").write_text(text.replace("R_", "Rot_"))
+    calibration_files.write_easymocap(folder, *calibration_files.scene(), calibration_files.NAMES)
     return folder
 
 
@@ -163,42 +162,10 @@ def write_colmap(folder):
     return folder
 
 
-TOML = """[cam_a]
-name = "a"
-size = [9, 9]
-matrix = [[60.0, 0.0, 5.0], [0.0, 60.0, 6.0], [0.0, 0.0, 1.0]]
-distortions = [0.0, 0.0, 0.0, 0.0]
-rotation = [3.0, 0.1, 0.2]
-translation = [0.0, 1.0, 3.0]
-[metadata]
-adjusted = false
-"""
-QUALISYS = """<calibration><cameras><camera serial="7">
-<fov_video left="0" top="0" right="63" bottom="47"/>
-<transform x="1" y="2000" z="3" r11="1" r12="0" r13="0" r21="0" r22="1" r23="0" r31="0" r32="0" r33="1"/>
-<intrinsic focalLengthU="6400" focalLengthV="6400" centerPointU="2048" centerPointV="1536" radialDistortion1="0"
- radialDistortion2="0" tangentalDistortion1="0" tangentalDistortion2="0"/></camera></cameras></calibration>
-"""
-
-
-def panoptic():
-    entry = {"name": "a", "K": K, "distCoef": [0.0] * 5, "R": np.eye(3).tolist(), "t": [[0], [1], [3]], "resolution": [9, 9]}
-    return {"cameras": [entry, entry | {"name": "b"}]}
-
-
-def shelf():
-    entry = {"fx": 60, "fy": 60, "cx": 5, "cy": 6, "R": np.eye(3).tolist(), "T": [[0], [1], [3]], "k": [0, 0, 0], "p": [0, 0]}
-    return {"0": entry, "1": entry}
-
-
 def write_colmap_binary(folder):
-    lens = struct.pack("<QiiQQ4d", 1, 1, 1, 10, 12, 60, 60, 5, 6)
-    (folder / "cameras.bin").write_bytes(lens)
-    image = lambda i, name: struct.pack("<i7di", i, 0, 1, 0, 0, 0, 0.9, 2.6, 1) + name + struct.pack("<Qddq", 1, 5, 6, i)
-    images = b"".join(image(i, f"photos/{name}.png\0".encode()) for i, name in enumerate(VIEWS, 1))
-    (folder / "images.bin").write_bytes(struct.pack("<Q", len(VIEWS)) + images)
-    point = lambda i: struct.pack("<Q3d3BdQii", i, 0, 0.9, 0, 9, 9, 9, 0.1, 1, i, 0)
-    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 2) + point(1) + point(2))
+    calibration_files.write_binary(folder, write_colmap(folder))
+    for file in folder.glob("*.txt"):
+        file.unlink()
     return folder
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import bvh_files
+import calibration_files
 import dataset_files
 import honest_files as honest
 import numpy as np
@@ -204,10 +205,10 @@ ROWS = {
     "easymocap": (read_cameras, honest.write_easymocap, "intri.yml"),
     "colmap": (read_cameras, honest.write_colmap, "images.txt"),
     "colmap binary": (read_cameras, honest.write_colmap_binary, "images.bin"),
-    "toml": (read_cameras, written("calib.toml", honest.TOML)),
-    "panoptic": (read_cameras, written("calibration_1.json", as_json(honest.panoptic))),
-    "shelf": (read_cameras, written("calibration_shelf.json", as_json(honest.shelf))),
-    "qualisys": (read_cameras, written("rig.qca.txt", honest.QUALISYS)),
+    "toml": (read_cameras, written("calib.toml", lambda: calibration_files.tables("cam_{}", "{}"))),
+    "panoptic": (read_cameras, written("calibration_1.json", as_json(calibration_files.panoptic))),
+    "shelf": (read_cameras, written("calibration_shelf.json", as_json(calibration_files.shelf))),
+    "qualisys": (read_cameras, written("rig.qca.txt", calibration_files.qualisys)),
     "import": (import_into, honest.write_import),
     "openpose": (read_detections, written("000_keypoints.json", honest.openpose)),
     "easymocap annots": (read_detections, written("000.json", honest.annots)),

@@ -17,7 +17,7 @@ import pytest
 from humangs_jax.core.progress import printable
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
+sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data", "data/datasets", ""))]
 
 from hostile_cases import all_cases  # noqa: E402
 from readers import FORMATS  # noqa: E402

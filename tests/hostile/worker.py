@@ -128,7 +128,7 @@ def too_long(*_):
 
 def prepare():
     """Paths of the test helpers, JAX on one CPU, and everything imported that readers import late."""
-    sys.path[:0] = [str(ROOT / "tests" / name) for name in ("hostile", "network", "data/datasets", "")]
+    sys.path[:0] = [str(ROOT / "tests" / name) for name in ("hostile", "network", "data", "data/datasets", "")]
     os.environ |= {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0"}
     import jax
 
