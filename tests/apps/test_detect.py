@@ -1,12 +1,12 @@
 """`humangs detect`: who is chosen, what is written, and what is said where that is not clear."""
 
-import json
 import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_json
 
 from humangs_jax import cli
 from humangs_jax.apps import detect
@@ -150,10 +150,7 @@ def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path
     """The second person of one view comes first there: only the cameras tell."""
     capture = load_capture("demo_capture")
     shutil.copytree(DEMO, tmp_path / "c")
-    description = json.loads((tmp_path / "c" / "capture.json").read_text())
-    for view in description["views"]:
-        view.pop("mask", None)
-    (tmp_path / "c" / "capture.json").write_text(json.dumps(description))
+    edit_json(tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]])
     model = landmark_model(capture.body, MEDIAPIPE_33.names)
     points = np.asarray(pose_landmarks(model, jnp.asarray(capture.betas), capture.pose(0))[0])
     shown = []

@@ -1,12 +1,12 @@
 """`humangs start`: what a folder has, what is said to be missing, and the way to the page."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json
 from PIL import Image
 
 from experiments.your_photos import landmarks_in, write_material
@@ -82,10 +82,7 @@ def test_alpha_is_a_mask(mine):
 
 @pytest.mark.parametrize("distortion", [0, 0.1])
 def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
-    calibration = json.loads((mine / "calibration.json").read_text())
-    for camera in calibration.values():
-        camera["dist"] = [distortion, 0, 0, 0, 0]
-    (mine / "calibration.json").write_text(json.dumps(calibration))
+    edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[distortion, 0, 0, 0, 0]) for camera in rig.values()])
     for name in ("masks", "keypoints"):
         shutil.rmtree(mine / name)
     for path in (mine / "images").iterdir():
@@ -133,10 +130,7 @@ def test_all_that_is_missing_is_told_at_once(mine, capsys):
 
 def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
     shutil.rmtree(mine / "keypoints")
-    calibration = json.loads((mine / "calibration.json").read_text())
-    for camera in calibration.values():
-        camera["dist"] = [0.1, 0, 0, 0, 0]
-    (mine / "calibration.json").write_text(json.dumps(calibration))
+    edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[0.1, 0, 0, 0, 0]) for camera in rig.values()])
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "inferencer_demo.py me/images --pose2d" in capsys.readouterr().out
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_npz
 from small import small_avatar
 
 from humangs_jax.avatar.animate import animate, skin
@@ -110,13 +111,15 @@ def test_broken_files_are_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match=r"a\.npz: not an avatar"):
         Avatar.load(path)
     make_avatar().save(path)
-    archive = dict(np.load(path))
+    archive = path.read_bytes()
+    version = lambda header: json.dumps(json.loads(str(header)) | {"version": 9})
     for change, message in (
-        ({"means": archive["means"][:, :2]}, "means: expected shape"),
-        ({"header": np.asarray(json.dumps(json.loads(str(archive["header"])) | {"version": 9}))}, "version 9"),
+        ({"means": lambda means: means[:, :2]}, "means: expected shape"),
+        ({"header": version}, "version 9"),
         ({"faces": None}, "missing keys"),
     ):
-        np.savez(path, **{k: v for k, v in (archive | change).items() if v is not None})
+        path.write_bytes(archive)
+        edit_npz(path, **change)
         with pytest.raises(ValueError, match=message):
             Avatar.load(path)
 

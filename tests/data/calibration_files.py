@@ -10,6 +10,7 @@ from humangs_jax.io.images import write_png
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 4
 NAMES = ("a", "b", "c", "d")
+FILES = tuple(f"{name}.png" for name in NAMES)
 LENS = [0.01, -0.02, 0.001, 0.002, 0.003]
 TARGET = np.asarray([0.1, 0.9, -0.2])
 Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json
 
 from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
@@ -15,16 +16,7 @@ from tests.data import calibration_files as written
 
 PIXELS = 1e-3
 """Largest reprojection error of what is written with all digits."""
-NAMES = ("a", "b", "c", "d")
-
-
-FILES = tuple(f"{name}.png" for name in NAMES)
-
-
-def change(file, edit):
-    values = json.loads(file.read_text())
-    edit(values)
-    file.write_text(json.dumps(values))
+FILES, NAMES = written.FILES, written.NAMES
 
 
 def views_of(out):
@@ -312,7 +304,7 @@ def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, probl
 )
 def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
     written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES)
-    change(tmp_path / "transforms.json", edit)
+    edit_json(tmp_path / "transforms.json", edit)
     written.write_photos(tmp_path / "photos", FILES)
     with pytest.raises(CaptureError, match=problem):
         import_cameras(tmp_path / "transforms.json", tmp_path / "photos", tmp_path / "out")
@@ -325,7 +317,7 @@ def at_moments(tmp_path, keys, poses=None):
     which = [0, 1, 2, 0, 1, 2] if poses is None else poses
     written.write_transforms(tmp_path / "transforms.json", K[which], all_poses[which], names)
     written.write_photos(tmp_path / "images", names)
-    change(tmp_path / "transforms.json", lambda v: [f.update(own) for f, own in zip(v["frames"], keys, strict=True)])
+    edit_json(tmp_path / "transforms.json", lambda v: [f.update(own) for f, own in zip(v["frames"], keys, strict=True)])
     return import_cameras(tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out", up="+y")
 
 

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from changes import edit_json
 from PIL import Image
 
 from humangs_jax.data.calibration.calibration import CONVENTIONS, WORLD_FROM_CAM_OPENGL, undistort
@@ -14,8 +15,7 @@ from humangs_jax.data.photos import on_white_background, read_description, read_
 from humangs_jax.io.images import read_grey, read_image
 from tests.data import calibration_files as written
 
-NAMES = ("a", "b", "c", "d")
-FILES = tuple(f"{name}.png" for name in NAMES)
+FILES, NAMES = written.FILES, written.NAMES
 
 
 @pytest.fixture
@@ -32,12 +32,6 @@ def import_rig(rig, **options):
 
 def views_of(out):
     return read_description(out / "capture.json")["views"]
-
-
-def change(file, edit):
-    values = json.loads(file.read_text())
-    edit(values)
-    file.write_text(json.dumps(values))
 
 
 # What is written ---------------------------------------------------------------------------------------------------
@@ -140,7 +134,7 @@ def distort_rig(file, coefficients):
         for camera in values.values():
             camera["distCoeff"] = list(coefficients)
 
-    change(file, edit)
+    edit_json(file, edit)
 
 
 def test_photos_and_masks_are_undistorted(rig, tmp_path):
@@ -159,7 +153,7 @@ def test_photos_and_masks_are_undistorted(rig, tmp_path):
 
 def test_alpha_becomes_a_mask_when_undistorted(rig):
     distort_rig(rig[0], [0.1, 0, 0, 0, 0])
-    change(rig[0], lambda values: values["a"].update(distCoeff=[0.0] * 5))  # one lens without
+    edit_json(rig[0], lambda values: values["a"].update(distCoeff=[0.0] * 5))  # one lens without
     for file in FILES:
         pixels = np.zeros((written.HEIGHT, written.WIDTH, 4), np.uint8)
         pixels[10:30, 20:40] = (255, 0, 0, 255)
@@ -278,7 +272,7 @@ def with_value(key, value):
     ],
 )
 def test_a_wrong_camera_is_named(rig, edit, problem):
-    change(rig[0], edit)
+    edit_json(rig[0], edit)
     with pytest.raises(CaptureError, match=problem) as error:
         import_rig(rig)
     assert "\n" not in str(error.value)
@@ -301,7 +295,7 @@ def test_photos_that_do_not_fit_are_named(rig, tmp_path):
     with pytest.raises(CaptureError, match=r"a\.png: not a readable image"):
         import_rig(rig)
     for camera in NAMES:
-        change(rig[0], lambda values, name=camera: values[name].pop("imgSize"))
+        edit_json(rig[0], lambda values, name=camera: values[name].pop("imgSize"))
     for frame, size in enumerate(((32, 48), (64, 48))):
         for camera in NAMES:
             written.write_photos(rig[1] / camera, [f"{frame}.png"], size)
@@ -421,7 +415,7 @@ def named_masks(tmp_path, key, names):
             if name is not None:
                 frame[key] = name
 
-    change(tmp_path / "transforms.json", edit)
+    edit_json(tmp_path / "transforms.json", edit)
     return tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out"
 
 

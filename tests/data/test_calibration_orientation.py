@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from changes import edit_json
 from PIL import Image
 
 from humangs_jax.data.calibration.calibration import distort
@@ -13,7 +14,7 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.io.images import orientation, oriented
 from tests.data import calibration_files as written
 
-NAMES = ("a", "b", "c", "d")
+NAMES = written.NAMES
 POINT = written.TARGET + np.asarray([0.12, 0.1, 0.05])
 LENS = np.asarray([0.05, 0.01, 0.02, -0.03, 0.0])
 OFF = 0.1
@@ -51,10 +52,7 @@ def phone(tmp_path, flag, lens=0 * LENS, mask=None, calibrated="stored", size=(w
         K[:, 0, 2], K[:, 1, 2] = shown[0] / 2 + 1.3, shown[1] / 2 - 0.8
     written.write_calibration_full(tmp_path / "rig.json", K, poses, NAMES, **changes)
     if changes["imgSize"] is None:
-        values = json.loads((tmp_path / "rig.json").read_text())
-        for camera in values.values():
-            del camera["imgSize"]
-        (tmp_path / "rig.json").write_text(json.dumps(values))
+        edit_json(tmp_path / "rig.json", lambda rig: [camera.pop("imgSize") for camera in rig.values()])
     back = {6: 8, 8: 6}.get(flag, flag)
     for name, k, pose in zip(NAMES, K, poses, strict=True):
         image = spot(k, pose, lens, size if calibrated == "stored" else shown)
@@ -136,6 +134,10 @@ def test_photos_of_one_camera_with_different_flags_are_refused(tmp_path):
         import_cameras(tmp_path / "rig.json", tmp_path, tmp_path / "me")
 
 
+def turn(K):
+    K[0][2], K[1][2] = K[1][2], K[0][2]
+
+
 def by_hand(tmp_path, turned_K):
     """A capture whose photos have a flag."""
     phone(tmp_path, 1)
@@ -144,10 +146,7 @@ def by_hand(tmp_path, turned_K):
         pixels = np.asarray(Image.open(file)) / 255
         save(file, pixels, 6)
     if turned_K:
-        description = json.loads((tmp_path / "me/capture.json").read_text())
-        for view in description["views"]:
-            view["K"][0][2], view["K"][1][2] = view["K"][1][2], view["K"][0][2]
-        (tmp_path / "me/capture.json").write_text(json.dumps(description))
+        edit_json(tmp_path / "me/capture.json", lambda me: [turn(view["K"]) for view in me["views"]])
     return tmp_path / "me"
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_json, edit_npz
 from small import tetrahedron
 
 from humangs_jax.data import photos as photos_module
@@ -97,10 +98,7 @@ def test_masks_put_photos_on_white_once(tmp_path):
     assert load(tmp_path / "me").masks is None
     mask = a["masks"][0]
     write_png(tmp_path / "me" / "mask.png", mask)
-    description = json.loads((tmp_path / "me" / "capture.json").read_text())
-    for view in description["views"]:
-        view["mask"] = "mask.png"
-    (tmp_path / "me" / "capture.json").write_text(json.dumps(description))
+    edit_description(tmp_path / "me", lambda d: [view.update(mask="mask.png") for view in d["views"]])
     expected = a["images"] * mask[..., None] + 1 - mask[..., None]
     np.testing.assert_allclose(load(tmp_path / "me").images, expected, atol=2 * HALF_LEVEL)
 
@@ -136,8 +134,8 @@ def test_alpha_is_the_mask_and_goes_onto_white(folder):
 
 
 def test_frame_may_be_left_out_for_a_single_pose(folder):
-    edit_parameters(folder, rotations=np.zeros((1, JOINTS, 3)), translations=np.zeros((1, 3)))
-    edit_json(folder, lambda d: [view.pop("frame") for view in d["views"]])
+    edit_npz(folder / "body.npz", rotations=np.zeros((1, JOINTS, 3)), translations=np.zeros((1, 3)))
+    edit_description(folder, lambda d: [view.pop("frame") for view in d["views"]])
     assert list(load(folder).frames) == [0, 0, 0]
 
 
@@ -146,7 +144,7 @@ def test_views_of_one_name_stay_apart(folder):
     (folder / "cam2").mkdir()
     for i in range(2):
         shutil.copy(folder / "images" / f"00{i}.png", folder / f"cam{i + 1}" / "0000.png")
-        edit_json(folder, lambda d, i=i: d["views"][i].update(image=f"cam{i + 1}/0000.png"))
+        edit_description(folder, lambda d, i=i: d["views"][i].update(image=f"cam{i + 1}/0000.png"))
     names = load(folder).names
     assert names == ("cam1_0000", "cam2_0000", "images_002")
 
@@ -177,32 +175,24 @@ def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeyp
 # What is wrong on disk: one line, file and field ---------------------------------------------------------------------
 
 
-def edit_json(folder, change):
-    description = json.loads((folder / "capture.json").read_text())
-    change(description)
-    (folder / "capture.json").write_text(json.dumps(description))
-
-
-def edit_parameters(folder, **changes):
-    with np.load(folder / "body.npz") as archive:
-        values = {**archive, **changes}
-    np.savez(folder / "body.npz", **{k: v for k, v in values.items() if v is not None})
+def edit_description(folder, change):
+    edit_json(folder / "capture.json", change)
 
 
 def view(i, **changes):
-    return lambda f: edit_json(f, lambda d: d["views"][i].update(changes))
+    return lambda f: edit_description(f, lambda d: d["views"][i].update(changes))
 
 
 def drop(i, key):
-    return lambda f: edit_json(f, lambda d: d["views"][i].pop(key))
+    return lambda f: edit_description(f, lambda d: d["views"][i].pop(key))
 
 
 def top(**changes):
-    return lambda f: edit_json(f, lambda d: d.update(changes))
+    return lambda f: edit_description(f, lambda d: d.update(changes))
 
 
 def parameters(**changes):
-    return lambda f: edit_parameters(f, **changes)
+    return lambda f: edit_npz(f / "body.npz", **changes)
 
 
 def with_nan(shape, index):
@@ -304,7 +294,7 @@ def test_bad_folder_is_one_line_with_file_and_field(folder, case):
 def test_no_folder_and_no_model_file(folder, tmp_path):
     with pytest.raises(CaptureError, match=r"nowhere/capture.json: no such file"):
         load(tmp_path / "nowhere")
-    edit_parameters(folder, body=np.asarray("../SMPLX.npz"))
+    edit_npz(folder / "body.npz", body=np.asarray("../SMPLX.npz"))
     with pytest.raises(CaptureError, match=r"body.npz: body: no model file at .*SMPLX.npz"):
         load_capture(folder)
     pytest.importorskip("humangs_jax.body.library")

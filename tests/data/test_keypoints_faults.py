@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from changes import changed, edit_bytes
 
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.reading import read_keypoints
@@ -16,7 +17,7 @@ def entry(image="front", confidence=0.75, shift=0.0, count=17, **more):
     return {"image_id": image, "keypoints": values.reshape(-1).tolist(), **more}
 
 
-def changed(index, value, image="front"):
+def with_number(index, value, image="front"):
     """An entry with one of its numbers replaced: 0 is the nose's x, 1 its y, 2 its confidence."""
     each = entry(image)
     each["keypoints"][index] = value
@@ -57,14 +58,14 @@ def test_frames_that_were_matched_in_order_are_told(tmp_path):
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, None])
 def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path, index, value):
-    keypoints = read(tmp_path / "k.json", [changed(index, value)])
+    keypoints = read(tmp_path / "k.json", [with_number(index, value)])
     assert keypoints.not_finite == 1 and np.isfinite(keypoints.points).all()
     assert keypoints.confidences[0, 0] == 0 and (keypoints.confidences[0, 1:] == 0.75).all()
 
 
 @pytest.mark.parametrize("confidence, clipped", [(1.02, 1.0), (2.0, 1.0), (-0.01, 0.0), (-1.0, 0.0)])
 def test_confidences_a_little_out_of_range_are_clipped(tmp_path, confidence, clipped):
-    assert read(tmp_path / "k.json", [changed(2, confidence)]).confidences[0, 0] == clipped
+    assert read(tmp_path / "k.json", [with_number(2, confidence)]).confidences[0, 0] == clipped
 
 
 def test_scores_of_another_scale_are_divided_by_the_largest_of_the_file_and_it_is_said(tmp_path):
@@ -84,7 +85,7 @@ def test_scores_of_another_scale_are_divided_by_the_largest_of_the_file_and_it_i
     ],
 )
 def test_points_half_an_image_outside_are_dropped_and_counted(tmp_path, index, value, kept):
-    keypoints = read(tmp_path / "k.json", [changed(index, value)])
+    keypoints = read(tmp_path / "k.json", [with_number(index, value)])
     assert (keypoints.confidences[0, 0] > 0) == kept and keypoints.far_outside == (not kept)
     assert keypoints.points[0, 0, index] == value + 0.5
 
@@ -158,13 +159,13 @@ FAULTS = {
     ),
     "two sets": ([entry(), entry("back", count=133)], r"image back: a person of 133 points, but another has 17"),
     "no triples": ([{"image_id": "front", "keypoints": [1.0] * 50}], r"\[0\]\.keypoints: expected a flat list of"),
-    "text": ([changed(0, "1")], r"\[0\]\.keypoints: expected numbers"),
+    "text": ([with_number(0, "1")], r"\[0\]\.keypoints: expected numbers"),
     "nested": ([{"image_id": "front", "keypoints": [[1, 2, 3], [4]]}], r"\[0\]\.keypoints: expected numbers"),
     "lacks points": ([entry(), {"image_id": "back"}], r"\[1\]\.keypoints: missing"),
     "lacks image": ([entry(), {"keypoints": [1]}], r"\[1\]\.image_id: expected the name or number of an image"),
     "other views": ([entry("x.jpg"), entry("y")], r"images x\.jpg, y are none of the views front, back"),
     "percent": ([entry(confidence=80.0)], r"view front: expected confidences in \[0, 1\], got 80 to 80"),
-    "logits": ([changed(2, -7.5)], r"view front: expected confidences in \[0, 1\], got -7\.5"),
+    "logits": ([with_number(2, -7.5)], r"view front: expected confidences in \[0, 1\], got -7\.5"),
     "all zero": ([entry(confidence=0.0)], r"no point has a confidence above 0"),
     "other photos": ([entry(shift=9000)], r"no point has a confidence above 0 \(not finite: 0, far outside .* 17\)"),
     "same image twice": ([entry("front.jpg"), entry("front.png")], r"'front\.jpg' and 'front\.png' are both for view"),
@@ -237,14 +238,13 @@ OWN = {"points": np.ones((2, 17, 2)), "confidences": np.ones((2, 17)), "set": np
     ],
 )
 def test_our_own_file_damaged(tmp_path, change, message):
-    arrays = {key: value for key, value in (OWN | change).items() if value is not None}
-    np.savez(tmp_path / "k.npz", **arrays)
+    np.savez(tmp_path / "k.npz", **changed(OWN, change))
     with pytest.raises(CaptureError, match=rf"k\.npz: {message}"):
         read_keypoints(tmp_path / "k.npz", NAMES, *SIZE)
 
 
 def test_our_own_file_cut_off(tmp_path):
     np.savez(tmp_path / "k.npz", **OWN)
-    (tmp_path / "k.npz").write_bytes((tmp_path / "k.npz").read_bytes()[:300])
+    edit_bytes(tmp_path / "k.npz", lambda data: data[:300])
     with pytest.raises(CaptureError, match=r"k\.npz: not a readable npz archive"):
         read_keypoints(tmp_path / "k.npz", NAMES, *SIZE)

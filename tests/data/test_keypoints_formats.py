@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from changes import edit_json
 
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -317,9 +318,7 @@ def test_people_of_our_detector_are_not_mixed_in_silence(tmp_path):
 def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, said):
     path = tmp_path / "keypoints.json"
     people_file(path)
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+    edit_json(path, change)
     with pytest.raises(CaptureError, match=said) as error:
         read(path, person=0)
     assert "\n" not in str(error.value)

@@ -1,6 +1,5 @@
 """The loader: deterministic, resumable, and never silent about what it leaves out."""
 
-import json
 import logging
 import shutil
 import threading
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_bytes, edit_json, edit_npz
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small import small_body
@@ -196,9 +196,7 @@ def test_captures_of_another_body_are_left_out(tmp_path):
     """Its joints and coefficients have the same shapes, and would be posed as those of the body that is trained on."""
     write_subject(tmp_path / "ours", 1)
     write_subject(tmp_path / "smplx", 2)
-    file = tmp_path / "smplx" / "body.npz"
-    with np.load(file) as arrays:
-        np.savez(file, **{**arrays, "body": "../SMPLX_NEUTRAL.npz"})
+    edit_npz(tmp_path / "smplx" / "body.npz", body="../SMPLX_NEUTRAL.npz")
     source = loader_of(CaptureCache(find_captures(tmp_path), BODY), SAMPLING, SIZE, SIZE)
     assert [greys(source.source.example(0, index, 2).inputs)[0][0] for index in range(4)] == [1] * 4
     assert "body: '../SMPLX_NEUTRAL.npz', but all captures of a run" in source.source.cache.broken[tmp_path / "smplx"]
@@ -294,21 +292,14 @@ def test_boundaries_find_every_fault_without_decoding(folder, tmp_path, monkeypa
             read_summary(root, BODY)
         return str(error.value)
 
-    def flip(root):
-        data = bytearray((root / "images" / "002.png").read_bytes())
-        data[-20] ^= 1
-        (root / "images" / "002.png").write_bytes(bytes(data))
+    def flip(data):
+        return data[:-20] + bytes([data[-20] ^ 1]) + data[-19:]
 
     def edit(**changes):
-        def change(root):
-            description = json.loads((root / "capture.json").read_text())
-            description["views"][4] |= changes
-            (root / "capture.json").write_text(json.dumps(description))
+        return lambda root: edit_json(root / "capture.json", lambda d: d["views"][4].update(changes))
 
-        return change
-
-    assert "002.png: not a readable image" in broken(flip)
-    cut = lambda root: (root / "masks" / "001.png").write_bytes((root / "masks" / "001.png").read_bytes()[:60])
+    assert "002.png: not a readable image" in broken(lambda root: edit_bytes(root / "images" / "002.png", flip))
+    cut = lambda root: edit_bytes(root / "masks" / "001.png", lambda data: data[:60])
     assert "001.png: not a readable image" in broken(cut)
     assert "005.png: no such image file" in broken(lambda root: (root / "images" / "005.png").unlink())
     small = np.zeros((SIZE // 2, SIZE, 3), np.float32)

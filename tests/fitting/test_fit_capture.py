@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_json, edit_npz
 from fit_people import NAMES_WITHIN_LIMITS, default_body, observe
 
 from humangs_jax.core.pytree import replace
@@ -18,6 +19,7 @@ from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_r
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_files import render_scan_views
 from humangs_jax.io import reading
+from humangs_jax.io.npz import read_npz
 
 SIZE = 16
 FRAMES = NAMES_WITHIN_LIMITS
@@ -99,8 +101,7 @@ def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path,
 @pytest.mark.slow
 def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
-    description = json.loads((path / "capture.json").read_text()) | {"body": "params/body.npz"}
-    (path / "capture.json").write_text(json.dumps(description))
+    edit_json(path / "capture.json", lambda d: d.update(body="params/body.npz"))
     for out in (None, tmp_path / "out"):
         target = check_place(path, out, overwrite=False)
         write_fitted(path, target, fitted.capture, fitted.report, fitted.record)
@@ -112,11 +113,8 @@ def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted,
 def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
-    with np.load(path / "fit.npz") as file:
-        arrays = dict(file)
-    for key in files.OPTIONAL:
-        arrays.pop(key)
-    np.savez(path / "fit.npz", deviations=arrays.pop("joint_std"), **arrays)
+    kept = read_npz(path / "fit.npz")[0]["joint_std"]
+    edit_npz(path / "fit.npz", deviations=kept, joint_std=None, **dict.fromkeys(files.OPTIONAL))
     np.testing.assert_array_equal(read_fit_record(path / "fit.npz").joint_std, fitted.record.joint_std.astype(np.float32))
 
 
@@ -215,9 +213,7 @@ def test_what_cannot_be_fitted_is_one_error(folder, change, message):
 def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message):
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
-    with np.load(path / "fit.npz") as file:
-        arrays = {**file, **change}
-    np.savez(path / "fit.npz", **{name: value for name, value in arrays.items() if value is not None})
+    edit_npz(path / "fit.npz", **change)
     with pytest.raises(CaptureError, match=message):
         read_fit_record(path / "fit.npz")
 

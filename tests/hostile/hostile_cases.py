@@ -11,6 +11,7 @@ from pathlib import Path
 
 import honest_files as honest
 import numpy as np
+from changes import edit_bytes, edit_text
 from honest_files import written as written
 from readers import FORMATS
 
@@ -65,9 +66,7 @@ def edited(name, old, new, inside=None):
     def make(folder):
         path = FORMATS[name].make(folder)
         file = path / inside if inside else path
-        text = file.read_text()
-        assert old in text
-        file.write_text(text.replace(old, new, 1), errors="replace")
+        edit_text(file, old, new)
         return path
 
     return make
@@ -81,8 +80,7 @@ def changed(name, change):
 
     def make(folder):
         path = FORMATS[name].make(folder)
-        file = FORMATS[name].damaged(path)
-        file.write_bytes(change(file.read_bytes()))
+        edit_bytes(FORMATS[name].damaged(path), change)
         return path
 
     return make

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from rounding import bound
 from target_cases import DRIVEN, PIXELS, SIZE, mapped_tube, small, views
-from training_cases import batch_of, without_upsampler
+from training_cases import batch_of, random_networks, source_of, without_upsampler
 
-from experiments.training import random_weights
 from humangs_jax.core.pytree import inexact_leaves, replace
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Example
+from humangs_jax.data.loading import CaptureCache, Example
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network import reader, transformer, vertex_decoder
 from humangs_jax.network.parts import stage
 from humangs_jax.training import diagnose, forward
@@ -254,40 +252,10 @@ def test_numbers_of_arrays():
     assert half.bad == 1 and half.norm == pytest.approx(1e30, rel=1e-2)
 
 
-@dataclasses.dataclass(frozen=True)
-class Spoilt:
-    """A source of which one example is not finite."""
-
-    source: CaptureSource
-    at: int
-
-    @property
-    def input_counts(self):
-        return self.source.input_counts
-
-    @property
-    def broken(self):
-        return self.source.broken
-
-    def __len__(self):
-        return len(self.source)
-
-    def example(self, seed, index, input_count):
-        example = self.source.example(seed, index, input_count)
-        if index == self.at:
-            example = jax.tree.map(np.array, example)
-            example.targets.images[0, 1, 2, 0] = np.nan  # no background that the network skips
-        return example
-
-    def describe(self, seed, index, input_count):
-        return self.source.describe(seed, index, input_count)
-
-
 @pytest.mark.slow
 def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
     def source(at):
-        make = lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
-        return lambda config: Spoilt(make(config), at)
+        return lambda config: source_of(cache, config, spoilt_at=at)
 
     cache = CaptureCache(captures, body)
     train(CONFIG, body, source(3), tmp_path, variables=variables, stop_at=5, progress=False)
@@ -341,9 +309,7 @@ def test_an_infinite_weight_of_a_loss_is_named(body, batch, variables):
 
 @pytest.mark.slow
 def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypatch, body, batch, variables):
-    keys = jax.random.split(jax.random.key(0))
-    heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
-    networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
+    networks = random_networks()
     loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
     config = dataclasses.replace(CONFIG, loss=loss, model=CONFIG.model.with_runtime(dtype="bfloat16"))
     fresh(monkeypatch)
@@ -354,7 +320,9 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypat
     for name in ("perceptual", "lpips"):
         assert stages[f"loss: {name}"].values[""].mean == pytest.approx(float(metrics[name]), rel=BFLOAT16)
     head = networks.lpips.heads[2].at[5].set(jnp.nan)
-    networks = replace(networks, lpips=replace(networks.lpips, heads=(*heads[:2], head, *heads[3:])))
+    networks = replace(
+        networks, lpips=replace(networks.lpips, heads=(*networks.lpips.heads[:2], head, *networks.lpips.heads[3:]))
+    )
     stored, computed = diagnose_step(init_state(config, variables), batch, body, config, networks).faults
     assert (stored.stage, stored.leaf.name, stored.leaf.first) == ("loss networks", "lpips.heads.2", (5,))
     assert (computed.direction, computed.stage) == ("forward", "loss: lpips")

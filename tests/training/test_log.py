@@ -1,6 +1,5 @@
 """The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
 
-import dataclasses
 import json
 import re
 import struct
@@ -8,8 +7,9 @@ import struct
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_cases import source_of
 
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, Waiting, subject_order
+from humangs_jax.data.loading import CaptureCache, Loader, Waiting, subject_order
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.config import tiny
 from humangs_jax.training.loop import MANY_SKIPPED, RunLog, Watch, forget_after
@@ -94,23 +94,9 @@ def test_a_process_that_does_not_record_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@dataclasses.dataclass(frozen=True)
-class Spoilt(CaptureSource):
-    """Captures, of which example 3 is not finite and example 4 is not in [0, 1]."""
-
-    def example(self, seed, index, input_count):
-        example = super().example(seed, index, input_count)
-        if index == 3:
-            example.targets.images[0, 1, 2, 0] = np.nan
-        if index == 4:
-            example.inputs.masks[1] *= 255
-        return example
-
-
 def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
     config = tiny()
-    cache, size = CaptureCache(captures, body), config.model.conventions.image_size
-    loader = Loader(Spoilt(cache, config.views, size, config.target_size), batch_size=2)
+    loader = Loader(source_of(CaptureCache(captures, body), config, spoilt_at=3, bright_at=4), batch_size=2)
     assert bad_samples(loader, 0) == bad_samples(loader, 0, loader.batch_at(0)) == []
     (one,), (other,) = bad_samples(loader, 1), bad_samples(loader, 2, loader.batch_at(2))
     order = [captures[i] for epoch in (0, 1) for i in subject_order(0, epoch, len(captures))]

@@ -83,25 +83,6 @@ def test_what_a_run_leaves_behind(whole):
     checkpoints.close()
 
 
-@pytest.mark.slow
-def test_a_signal_saves_and_ends_the_run(body, captures, variables, tmp_path, monkeypatch, caplog):
-    def interrupted(*arguments):
-        result = train_step(*arguments)
-        signal.raise_signal(signal.SIGTERM)
-        return result
-
-    handler = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(loop, "train_step", interrupted)
-    with caplog.at_level(logging.WARNING), pytest.raises(loop.TrainingInterrupted, match="after 1 of 60 steps") as stopped:
-        train(CONFIG, body, captures[:2], tmp_path, variables=variables, progress=False)
-    assert int(stopped.value.state.step) == 1 and "stopping after this step" in caplog.text
-    assert isinstance(stopped.value, KeyboardInterrupt)  # a loop of runs ends
-    assert signal.getsignal(signal.SIGTERM) is handler
-    checkpoints = Checkpoints(tmp_path / "checkpoints")
-    assert checkpoints.steps == [1]
-    checkpoints.close()
-
-
 def quick(step=None):
     """A step that computes nothing, and then does something else."""
 
@@ -115,16 +96,17 @@ def quick(step=None):
 
 
 @pytest.mark.parametrize(("at", "number"), [(1, signal.SIGINT), (2, signal.SIGTERM), (3, signal.SIGINT)])
-def test_a_signal_ends_a_loop_of_runs_when_all_is_saved(at, number, body, captures, variables, tmp_path, monkeypatch):
+def test_a_signal_ends_a_loop_of_runs_when_all_is_saved(at, number, body, captures, variables, tmp_path, monkeypatch, caplog):
     """Also one that comes in the last step, which is then done."""
     monkeypatch.setattr(loop, "train_step", quick(lambda done: done == at and signal.raise_signal(number)))
     options = {"variables": variables, "progress": False}
-    begun = []
-    with pytest.raises(KeyboardInterrupt):
+    begun, handler = [], signal.getsignal(number)
+    with caplog.at_level(logging.WARNING), pytest.raises(loop.TrainingInterrupted, match=f"after {at} of 3 steps") as stopped:
         for name in ("a", "b"):
             begun.append(name)
             train(dataclasses.replace(CONFIG, steps=3), body, captures[:2], tmp_path / name, **options)
-    assert begun == ["a"]
+    assert begun == ["a"] and signal.getsignal(number) is handler and isinstance(stopped.value, KeyboardInterrupt)
+    assert int(stopped.value.state.step) == at and "stopping after this step" in caplog.text
     checkpoints = Checkpoints(tmp_path / "a" / "checkpoints")
     assert checkpoints.steps[-1] == at and (tmp_path / "a" / "weights.safetensors").is_file()
     checkpoints.close()

@@ -10,18 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rounding import bound
-from training_cases import without_upsampler
+from training_cases import random_networks, source_of, without_upsampler
 
-from experiments.training import random_weights
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import reconstruct_views
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.loading import CaptureCache, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Drawn
 from humangs_jax.rendering.splatting import Rendering, render
@@ -39,8 +37,7 @@ CONFIG = tiny()
 
 @pytest.fixture(scope="module")
 def source(body, captures):
-    views = CaptureCache(captures, body), CONFIG.views, CONFIG.model.conventions.image_size, CONFIG.target_size
-    return Loader(CaptureSource(*views), CONFIG.batch_size)
+    return Loader(source_of(CaptureCache(captures, body), CONFIG), CONFIG.batch_size)
 
 
 def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):
@@ -185,9 +182,7 @@ def test_a_loss_without_its_network_is_an_error_not_a_number(body, source, varia
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype):
-    keys = jax.random.split(jax.random.key(0))
-    heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
-    networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
+    networks = random_networks()
     config = dataclasses.replace(WITH_NETWORKS, model=CONFIG.model.with_runtime(dtype=dtype))
     state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
     weights = dataclasses.asdict(config.loss)

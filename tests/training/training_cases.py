@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -9,6 +10,8 @@ from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import capture_from_arrays, save_capture
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.config import paper_parts
 
 SIDES, RINGS, SIZE, VIEWS, POSES = 8, 8, 32, 6, 2
@@ -93,7 +96,34 @@ def write_subject(path, body, seed):
     save_capture(path, capture)
 
 
+@dataclasses.dataclass(frozen=True)
+class Spoilt(CaptureSource):
+    """Captures of which one example is not finite, and another one not in [0, 1]."""
+
+    spoilt_at: int = -1
+    bright_at: int = -1
+
+    def example(self, seed, index, input_count):
+        example = jax.tree.map(np.array, super().example(seed, index, input_count))
+        if index == self.spoilt_at:
+            example.targets.images[0, 1, 2, 0] = np.nan  # no background that the network skips
+        if index == self.bright_at:
+            example.inputs.masks[1] *= 255
+        return example
+
+
+def source_of(cache, config, **spoilt):
+    return Spoilt(cache, config.views, config.model.conventions.image_size, config.target_size, **spoilt)
+
+
 def batch_of(body, captures, config, step=0):
-    size = config.model.conventions.image_size
-    source = Loader(CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size)
-    return source.batch_at(step)
+    return Loader(source_of(CaptureCache(captures, body), config), config.batch_size).batch_at(step)
+
+
+def random_networks():
+    """VGG-19, and LPIPS over VGG-16."""
+    from experiments.training import random_weights  # not on the path of the programs that tests start
+
+    keys = jax.random.split(jax.random.key(0))
+    heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
+    return LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))

@@ -1,14 +1,14 @@
 """Ways to damage a file of a data set: each makes a function of the folder that holds it."""
 
-import json
 import pickle
 import zipfile
 
 import numpy as np
+from changes import edit_bytes, edit_json, edit_npz, edit_pickle, edit_text
 
 
 def bytes_of(path, change):
-    return lambda folder: (folder / path).write_bytes(change((folder / path).read_bytes()))
+    return lambda folder: edit_bytes(folder / path, change)
 
 
 def removed(path):
@@ -24,43 +24,20 @@ def a_folder(path):
 
 
 def text(path, old, new):
-    def damage(folder):
-        content = (folder / path).read_text()
-        assert old in content
-        (folder / path).write_text(content.replace(old, new, 1))
-
-    return damage
+    return lambda folder: edit_text(folder / path, old, new)
 
 
 def npz(path, **changes):
     """Entries replaced by a function of them; None removes one."""
-
-    def damage(folder):
-        values = dict(np.load(folder / path))
-        values |= {key: change(values[key]) for key, change in changes.items() if change}
-        kept = {key: x for key, x in values.items() if key not in changes or changes[key]}
-        np.savez(folder / path, **kept)
-
-    return damage
+    return lambda folder: edit_npz(folder / path, **changes)
 
 
 def pkl(path, **changes):
-    def damage(folder):
-        values = pickle.loads((folder / path).read_bytes())
-        values |= {key: change(values[key]) for key, change in changes.items() if change}
-        kept = {key: x for key, x in values.items() if key not in changes or changes[key]}
-        (folder / path).write_bytes(pickle.dumps(kept))
-
-    return damage
+    return lambda folder: edit_pickle(folder / path, **changes)
 
 
 def jsn(path, change):
-    def damage(folder):
-        content = json.loads((folder / path).read_text())
-        change(content)
-        (folder / path).write_text(json.dumps(content))
-
-    return damage
+    return lambda folder: edit_json(folder / path, change)
 
 
 def spoiled(value, at=0):
@@ -84,12 +61,7 @@ def evil_pickle(folder_path):
 
 
 def object_npz(path, key):
-    def damage(folder):
-        values = dict(np.load(folder / path))
-        values[key] = np.asarray([Evil()], object)
-        np.savez(folder / path, **values)
-
-    return damage
+    return npz(path, **{key: np.asarray([Evil()], object)})
 
 
 def bomb(path):
@@ -112,11 +84,6 @@ def bomb(path):
         (folder / path).write_bytes(data.replace(size, (2147483648).to_bytes(4, "little")))
 
     return damage
-
-
-def pkl_at(folder, path, **values):
-    content = pickle.loads((folder / path).read_bytes())
-    (folder / path).write_bytes(pickle.dumps(content | values))
 
 
 def scale_obj(path, factor):

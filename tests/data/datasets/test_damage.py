@@ -14,6 +14,7 @@ import dataset_files as files
 import h5_or_skip
 import numpy as np
 import pytest
+from changes import edit_pickle
 from damages import (
     a_folder,
     bomb,
@@ -23,7 +24,6 @@ from damages import (
     npz,
     object_npz,
     pkl,
-    pkl_at,
     removed,
     scale_obj,
     spoiled,
@@ -204,7 +204,7 @@ thuman("a pickle of a list", lambda f: (f / FIT).write_bytes(pickle.dumps([1])),
 for key in ("scale", "global_orient", "body_pose", "left_hand_pose", "betas", "expression"):
     case("thuman", f"{key} missing", pkl(FIT, **{key: None}), PKL, key, "missing")
 thuman("neither transl nor translation", pkl(FIT, transl=None), PKL, "transl")
-thuman("both of them", lambda f: pkl_add(f, translation=np.zeros((1, 3))), PKL, "either transl")
+thuman("both of them", pkl(FIT, translation=np.zeros((1, 3))), PKL, "either transl")
 thuman("a NaN", pkl(FIT, body_pose=spoiled(np.nan)), PKL, "body_pose", "finite")
 thuman("a scale of 0", pkl(FIT, scale=lambda x: 0 * x), PKL, "scale", "positive")
 thuman("a negative scale", pkl(FIT, scale=lambda x: -x), PKL, "scale", "positive")
@@ -212,7 +212,7 @@ thuman("two scales", pkl(FIT, scale=lambda x: np.ones(2)), PKL, "scale", "(2,)")
 thuman("hands of 6 numbers", pkl(FIT, left_hand_pose=lambda x: x[:, :6]), "left_hand_pose", "45", "6")
 thuman(
     "hands of two kinds",
-    lambda f: pkl_at(f, "smplx/0000/smplx_param.pkl", right_hand_pose=np.zeros((1, 45), np.float32)),
+    pkl("smplx/0000/smplx_param.pkl", right_hand_pose=np.zeros((1, 45), np.float32)),
     "right_hand_pose",
     "12 or 45",
 )
@@ -239,13 +239,9 @@ thuman("a scan with a NaN", text(SCAN, "v ", "v nan 0 0\nv "), "0001.obj")
 thuman("no folder model", lambda f: (f / "model").rename(f / "models"), "model", "no such folder")
 
 
-def pkl_add(folder, **values):
-    pkl_at(folder, FIT, **values)
-
-
 def pkl_swap(folder, one, other):
     content = pickle.loads((folder / FIT).read_bytes())
-    pkl_at(folder, FIT, **{one: content[other], other: content[one]})
+    edit_pickle(folder / FIT, **{one: content[other], other: content[one]})
 
 
 # Scene lists ------------------------------------------------------------------------------------------------------------
