@@ -162,6 +162,8 @@ def stage(name: str) -> Generator[None]:
 def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any) -> Any:
     """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around it.
 
+    Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.
+
     Arguments: shown: whether the caller of the library asked for bars; a program may still hide all of them.
     """
     from tqdm import tqdm
@@ -171,6 +173,8 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
         sys.stderr.write(CLEAR)
     if how.get("desc") is not None:
         how["desc"] = printable(how["desc"])
+    if not sys.stderr.isatty():
+        how = {"mininterval": LONG, "maxinterval": LONG} | how
     made = tqdm(iterable, disable=not shown or _current.quiet, **how)
     if not made.disable:
         _bars.add(made)

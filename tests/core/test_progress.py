@@ -111,6 +111,12 @@ def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
     assert "humangs: warning: odd" in lines_of(captured) and r"a\x1b[2J\nb" in captured and "\x1b[2J" not in captured
 
 
+def test_a_bar_in_a_log_is_a_few_lines(capsys):
+    for _ in progress.bar(range(300), desc="render"):
+        time.sleep(0.001)
+    assert capsys.readouterr().err.count("render") <= 3  # the first, perhaps one between, the last
+
+
 def test_tables_are_aligned_and_rows_may_end_early():
     rows = [["view", "error", "share"], ["a long name", "1.0 px", "7%", "!"], ["b", "-"]]
     assert progress.text_table(rows) == ["view          error  share", "a long name  1.0 px     7%  !", "b                 -"]
