@@ -1,9 +1,12 @@
 """What eyes see of an avatar: LPIPS of the whole person and of the head, errors in the foreground, what is drawn beside it."""
 
+import contextlib
 import functools
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
+from unittest import mock
 
 import jax
 import numpy as np
@@ -11,18 +14,28 @@ import numpy as np
 from experiments.harness import Run, entry, means
 from experiments.pictures import details, frontal_view, write_triples
 from experiments.refinement import with_body_off
-from experiments.results import markdown_table
-from experiments.subjects import People, make_evaluation_subject, shipped_digest, task_views
+from experiments.results import markdown_table, write_json
+from experiments.subjects import TASKS, People, file_digest, make_evaluation_subject, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.sheets import tile
+from humangs_jax.data.usable_views import MASK_THRESHOLD
+from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.io.images import write_png
+from humangs_jax.io.reading import read_json
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.perceptual import lpips
+from humangs_jax.refinement import learned
 from humangs_jax.refinement.config import HEAD_STEPS, ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import SHIPPED
 from humangs_jax.refinement.refine import refine
 
 VIEWS = 4
 NETS = ("alex", "vgg")
+LOOSEST, WORST = 10, 5
+"""Of the people, those whose clothes are farthest from the body, and those whose foreground is worst, are listed apart."""
+JUDGED, PAIR_ZOOM, PAIRS_A_SHEET = ("face", "hand", "hem"), 2, 12
+"""Of `DETAILS`, those that `appearance_votes` is about."""
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_fg": ("foreground", 2),
@@ -32,11 +45,13 @@ SHOWN = {
     "vgg_head": ("head", 3),
     "outside": ("alpha outside", 3),
 }
-Variant = Literal["iterations alone", "displaced body", "steps on the head", "default"]
+Variant = Literal["iterations alone", "displaced body", "steps on the head", "edges of 2 cm", "edges of 1.5 cm", "default"]
 VARIANTS: dict[Variant, dict[str, Any]] = {
     "iterations alone": {"displacement": False, "head_steps": 0},
     "displaced body": {"displacement": True, "head_steps": 0},
     "steps on the head": {"displacement": False, "head_steps": HEAD_STEPS},
+    "edges of 2 cm": {"displacement": None, "head_steps": HEAD_STEPS, "longest_edge": 0.02},
+    "edges of 1.5 cm": {"displacement": None, "head_steps": HEAD_STEPS, "longest_edge": 0.015},
     "default": {"displacement": None, "head_steps": HEAD_STEPS},
 }
 """How the body is displaced to the masks, and steps on the head."""
@@ -45,11 +60,13 @@ VARIANTS: dict[Variant, dict[str, Any]] = {
 @entry
 def appearance(
     run: Run,
-    people: People = People(8, held_out=6, poses=0),
+    people: People = People(32, held_out=6, poses=1),
     sizes: tuple[int, ...] = (256, 512),
     off: tuple[float, ...] = (0.0, 5.0),
     variants: tuple[Variant, ...] = ("iterations alone", "default"),
+    first_refiner: Path | None = None,
     details_sheet: Path | None = None,
+    pairs: Path | None = None,
 ) -> None:
     """What eyes see of avatars of four photos, as `humangs reconstruct` makes them, from other cameras.
 
@@ -59,37 +76,74 @@ def appearance(
     sizes: sides of the photos in pixels (--size is not used)
     off: millimetres that the body is off, see `refinement`
     variants: how avatars are made
+    first_refiner: weights of the learned update for the first variant; default: the shipped ones
     details_sheet: faces, hands, hems and shoes: truth and the first two variants, largest size
+    pairs: folder of sheets that show the first two variants in random order, for `appearance_votes`
     """
     start = people.start()
     networks = {net: load_lpips(net) for net in NETS}
     settings = start.settings | {"sizes": sizes, "off": off, "variants": variants, "refiner": shipped_digest(SHIPPED)}
+    settings |= {"first_refiner": first_refiner and file_digest(first_refiner)}
 
     def measure(seed):
         row: dict[str, Any] = {}
         person = functools.cache(lambda size: make_evaluation_subject(seed, start.body, (VIEWS,), size, start.held_out))
         for size, wrong in itertools.product(sizes, off):
             subject = with_body_off(person(size), wrong)
-            still = subject.held_out.select(task_views(subject.held_out)["novel"])
-            drawn = {name: _drawn(start, subject.inputs(VIEWS), still, **VARIANTS[name]) for name in variants}
-            row[f"{size} {wrong:g}"] = {name: scores_of(*images, still, networks) for name, images in drawn.items()}
-        view = frontal_view(subject.photos, still, list(range(still.view_count)))
-        pictures = [still.images[view], *(images[view] for images, _ in drawn.values())][:3]
-        return row, [np.concatenate(list(details(image, still, view)), axis=1) for image in pictures]
+            truth, inputs, drawn = subject.held_out, subject.inputs(VIEWS), {}
+            for name in variants:
+                refiner = first_refiner if name == variants[0] else None
+                drawn[name] = _drawn(start, inputs, truth, refiner, **VARIANTS[name])
+            for task, views in task_views(truth).items():
+                seen = truth.select(views)
+                of_task = {name: (images[views], alpha[views]) for name, (images, alpha) in drawn.items()}
+                if len(views):
+                    scores = {name: scores_of(*images, seen, networks) for name, images in of_task.items()}
+                    row[f"{size} {wrong:g} {task}"] = scores
+        view = frontal_view(subject.photos, truth, task_views(truth)["novel"].tolist())
+        pictures = [truth.images[view], *(images[view] for images, _ in drawn.values())][:3]
+        row["loose"] = looseness(person(min(sizes)).inputs(VIEWS), start.config)
+        return row, [details(image, truth, view) for image in pictures]
 
     cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
-    rows = list(run.rows(cases, settings, again=bool(details_sheet)).values())
-    numbers = means(rows)
+    rows = list(run.rows(cases, settings, again=bool(details_sheet or pairs)).values())
+    numbers = {group: means(chosen) for group, chosen in groups_of(rows, variants[0]).items()}
     run.show(appearance_section(numbers, start), {"settings": settings, "means": numbers, "people": len(rows)})
     if details_sheet:
-        write_triples(details_sheet, run.pictures, 1)
+        sheets = {seed: [np.concatenate(list(x), axis=1) for x in shown] for seed, shown in run.pictures.items()}
+        write_triples(details_sheet, sheets, 1, headers=("truth", *variants[:2]))
+    if pairs:
+        write_pairs(pairs, run.pictures, variants[:2])
 
 
-def _drawn(start, photos, held_out, displacement, head_steps):
-    """Images and alpha of held-out views of an avatar."""
-    config = start.config.with_runtime(displacement=displacement)
+def looseness(photos: Any, config: Any) -> float:
+    """Share of the person in the photos that is beside the body."""
+    views = standardize(photos, config.image_size)
+    inputs = _prepared(gaussian_body(photos.body, config), views, config)
+    mask = np.asarray(views.masks) > MASK_THRESHOLD
+    return 1 - float((np.asarray(inputs.depth_maps >= 0) & mask).sum() / mask.sum())
+
+
+_prepared = jax.jit(prepare_inputs)
+
+
+def groups_of(rows: list[dict[str, Any]], first: str) -> dict[str, list[dict[str, Any]]]:
+    """All people, the loosest, and those whose foreground is worst by the first variant."""
+    loosest = sorted(rows, key=lambda row: -row["loose"])[:LOOSEST]
+    cell = next(iter(rows[0]))
+    worst = sorted(rows, key=lambda row: row[cell][first]["psnr_fg"])[:WORST]
+    groups = {"all": rows, f"{LOOSEST} loosest": loosest, f"{WORST} worst": worst}
+    return groups if len(rows) > LOOSEST else {"all": rows}
+
+
+def _drawn(start, photos, held_out, refiner, displacement, head_steps, longest_edge=None):
+    """Images and alpha of held-out views of an avatar. refiner: weights of the learned update instead of the shipped ones."""
+    own = mock.patch.object(learned, "load_refiner", functools.partial(learned.read_refiner, refiner))
+    config = start.config.with_runtime(displacement=displacement, longest_edge=longest_edge)
     how = RefineConfig(iterations=ITERATIONS, steps=0, head_steps=head_steps)
-    drawn = draw_views(refine(reconstruct(start.variables, config, photos), photos, how), held_out)
+    with own if refiner else contextlib.nullcontext():
+        avatar = refine(reconstruct(start.variables, config, photos), photos, how)
+    drawn = draw_views(avatar, held_out)
     return drawn.images, np.asarray(drawn.alpha)
 
 
@@ -120,11 +174,55 @@ def _heads(images, views):
 def appearance_section(numbers: dict[str, Any], start: Any) -> str:
     """The table."""
     rows = []
-    for case, variants in numbers.items():
-        size, off = case.split()
-        for name, scores in variants.items():
-            shown = [f"{scores[key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
-            rows.append([f"{size} px", f"{off} mm", name, *shown])
-    header = ["photos", "body off", "avatar", *(heading for heading, _ in SHOWN.values())]
-    about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras, the same pose."
-    return f"{about}\n\n{markdown_table(header, rows, 'lll' + 'r' * len(SHOWN))}"
+    for case in [case for case in numbers["all"] if case != "loose"]:
+        size, off, task = case.split()
+        for (group, means_of), name in itertools.product(numbers.items(), numbers["all"][case]):
+            shown = [f"{means_of[case][name][key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
+            rows.append([f"{size} px", f"{off} mm", TASKS[task], group, name, *shown])
+    header = ["photos", "body off", "views", "people", "avatar", *(heading for heading, _ in SHOWN.values())]
+    about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
+    return f"{about}\n\n{markdown_table(header, rows, 'lllll' + 'r' * len(SHOWN))}"
+
+
+# A blind comparison -------------------------------------------------------------------------------------------------------
+
+
+def write_pairs(folder: Path, pictures: dict[str, list[np.ndarray]], names: Sequence[str]) -> None:
+    """Sheets of truth, A and B for each person and detail in random order, and key.json: which of the variants A is."""
+    rng, key, tiles = np.random.default_rng(0), [], []
+    which = [(seed, i) for seed in pictures for i in range(len(JUDGED))]
+    for number in rng.permutation(len(which)):
+        seed, detail = which[number]
+        flipped = int(rng.integers(2))
+        truth, *both = (image[detail].repeat(PAIR_ZOOM, 0).repeat(PAIR_ZOOM, 1) for image in pictures[seed])
+        tiles += [truth, both[flipped], both[1 - flipped]]
+        key.append({"person": seed, "detail": JUDGED[detail], "A": names[flipped], "B": names[1 - flipped]})
+    folder.mkdir(parents=True, exist_ok=True)
+    for first in range(0, len(key), PAIRS_A_SHEET):
+        shown = tiles[3 * first : 3 * (first + PAIRS_A_SHEET)]
+        labels = [text for i in range(first, first + len(shown) // 3) for text in (f"{i + 1}", "A", "B")]
+        write_png(folder / f"pairs_{first // PAIRS_A_SHEET}.png", tile(np.stack(shown), labels=labels, columns=6))
+    write_json(folder / "key.json", key)
+
+
+@entry
+def appearance_votes(run: Run, pairs: Path, votes: Path) -> None:
+    """What was preferred in the sheets of `appearance --pairs`.
+
+    Options:
+    pairs: the folder
+    votes: a text file: A, B or = for each pair, in their order
+    """
+    key, given = read_json(pairs / "key.json"), votes.read_text().split()
+    if len(given) != len(key) or set(given) - set("AB="):
+        raise ValueError(f"{votes}: expected A, B or = for each of {len(key)} pairs, got {len(given)} words")
+    names = sorted({pair["A"] for pair in key} | {pair["B"] for pair in key})
+    chosen = [pair.get(vote, "=") for pair, vote in zip(key, given, strict=True)]
+    counted = lambda detail: [
+        sum(choice == wanted and detail in (None, pair["detail"]) for choice, pair in zip(chosen, key, strict=True))
+        for wanted in (*names, "=")
+    ]
+    rows = [[title, *counted(detail)] for title, detail in [*((name, name) for name in JUDGED), ("all", None)]]
+    table = markdown_table(["detail", *names, "no difference"], rows, "l" + "r" * (len(names) + 1))
+    about = f"{len(key)} pairs in random order, judged once each, without knowing which is which; the true image beside them."
+    run.show(f"{about}\n\n{table}", {"votes": {title: counts for title, *counts in rows}, "names": names})

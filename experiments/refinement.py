@@ -95,14 +95,20 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
     """The person, whose photos and held-out views of the same pose come with a body that is off."""
     if not millimetres:
         return subject
-    rng, poses = np.random.default_rng(subject.seed), subject.photos.poses
-    off = lambda array, std: jnp.asarray(np.asarray(array) + millimetres * std * rng.normal(size=array.shape), jnp.float32)
-    rotations = off(poses.rotations[:1], np.radians(DEGREES))
-    poses = replace(poses, rotations=rotations, translation=off(poses.translation[:1], 1e-3))
-    betas = off(np.asarray(subject.photos.betas), SHAPES)
+    poses, betas = subject.photos.poses[:1], subject.photos.betas
+    poses, betas = body_off(poses, betas, millimetres, subject.seed)
     moved = lambda capture: dataclasses.replace(capture, poses=poses, betas=betas)
     still = subject.held_out.select(task_views(subject.held_out)["novel"])
     return dataclasses.replace(subject, photos=moved(subject.photos), held_out=moved(still))
+
+
+def body_off(poses: Any, betas: Any, millimetres: float, seed: int) -> tuple[Any, Any]:
+    """Poses (p,) and shape coefficients with the errors of a fit, the same of all poses."""
+    rng = np.random.default_rng(seed)
+    off = lambda array, std: jnp.asarray(millimetres * std * rng.normal(size=array.shape), jnp.float32)
+    rotations = poses.rotations + off(poses.rotations[:1], np.radians(DEGREES))
+    poses = replace(poses, rotations=rotations, translation=poses.translation + off(poses.translation[:1], 1e-3))
+    return poses, jnp.asarray(betas) + off(betas, SHAPES)
 
 
 def _refined(start, subject, count, how, seconds):

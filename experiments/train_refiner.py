@@ -23,6 +23,7 @@ from flax import serialization
 from tqdm import tqdm
 
 from experiments.harness import Run, entry
+from experiments.refinement import body_off
 from experiments.results import write_json
 from humangs_jax.avatar.animate import without_low_pass
 from humangs_jax.avatar.avatar import Avatar
@@ -36,7 +37,9 @@ from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import to_uint8
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import read_json
+from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.metrics import structural_dissimilarity
+from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
@@ -45,6 +48,7 @@ from humangs_jax.refinement.learned import (
     Refiner,
     Signals,
     graph_of,
+    load_refiner,
     photo_signals,
     read_refiner,
     refiner_iteration,
@@ -60,7 +64,7 @@ from humangs_jax.rendering.splatting import render
 
 FIRST_SEED = 6000
 """Of the training range, after those of the shipped network."""
-SIZE, PHOTOS, TARGETS = 256, 4, 6
+PHOTOS, TARGETS = 4, 6
 COUNTS = (1, 2, 4, 4, 4, 4, 6)
 """Numbers of photos that a step draws from; with 6, the first two targets are photos, too."""
 ROUND_WEIGHT = 0.9
@@ -76,13 +80,19 @@ class Refining:
     """Options:
     people: of the samples
     samples: to train on
-    start: weights to start from, of all layers or some; default: a network that changes nothing
+    size: side of the views in pixels
+    off: millimetres that the bodies of half of the samples are off, see `refinement`; they are displaced to the masks
+    start: weights to start from, of all layers or some; default: a network that changes nothing; "shipped": the package's own
+    lpips: weight of LPIPS (AlexNet) in the loss; needs the extra `lpips`
     batch: samples in a step, a thread each
     """
 
     people: int = 400
     samples: int = 600
-    start: Path | None = None
+    size: int = 256
+    off: float = 5.0
+    start: str | None = None
+    lpips: float = 0.3
     steps: int = 1300
     iterations: int = 3
     batch: int = 2
@@ -106,15 +116,15 @@ def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
         write_json(path, settings)
     elif (known := read_json(path)) != settings:
         raise ValueError(f"{path}: this run has other settings, {known}: give another folder")
-    folders = make_samples(out / "samples", FIRST_SEED, options.people, options.samples)
-    validation = make_samples(out / "validation", FIRST_SEED + options.people, VALIDATED, VALIDATED)
+    folders = make_samples(out / "samples", FIRST_SEED, options.people, options.samples, options)
+    validation = make_samples(out / "validation", FIRST_SEED + options.people, VALIDATED, VALIDATED, options)
     train(folders, validation, out, options)
 
 
 # Samples ------------------------------------------------------------------------------------------------------------------
 
 
-def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
+def make_samples(out: Path, first: int, people: int, count: int, options: Refining) -> list[Path]:
     """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are there are kept."""
     folders = [out / f"{i:05d}" for i in range(count)]
     missing = [folder for folder in folders if not (folder / "views.npz").is_file()]
@@ -126,25 +136,28 @@ def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
         seeds = seeds_of("train", first, people)
         save_bank(path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True))
     bank, make = load_bank(path), jax.jit(on_the_fly_example, static_argnames="config")
-    config = OnTheFlyConfig(input_views=PHOTOS, target_views=TARGETS, input_size=SIZE, target_size=SIZE)
+    config = OnTheFlyConfig(input_views=PHOTOS, target_views=TARGETS, input_size=options.size, target_size=options.size)
     for folder in tqdm(missing, desc="samples"):
         example = jax.device_get(make(bank, jax.random.key(int(folder.name)), config))
-        photos = jax.tree.map(jnp.asarray, example.inputs)
+        photos, targets = jax.tree.map(jnp.asarray, (example.inputs, example.targets))
+        both = jax.tree.map(lambda *x: jnp.concatenate(x), photos, targets)
+        poses, betas = BodyPose(both.rotations, both.translations), photos.betas
+        if int(folder.name) % 2 and options.off:
+            poses, betas = body_off(poses, betas, options.off, int(folder.name))
         capture = Capture(
             images=example.inputs.images,
             masks=example.inputs.masks,
-            cameras=photos.cameras,
+            cameras=both.cameras[:PHOTOS],
             frames=np.arange(PHOTOS),
             body=body,
-            betas=photos.betas,
-            poses=BodyPose(photos.rotations, photos.translations),
+            betas=betas,
+            poses=poses[:PHOTOS],
             names=tuple(map(str, range(PHOTOS))),
         )
         folder.mkdir(parents=True, exist_ok=True)
         without_low_pass(reconstruct(*weights, capture)).save(folder / "avatar.npz")
-        both = jax.tree.map(lambda *x: jnp.concatenate(x), photos, jax.tree.map(jnp.asarray, example.targets))
         arrays = {name: to_uint8(getattr(both, name)) for name in ("images", "masks")}
-        arrays |= {name: getattr(both, name) for name in ("rotations", "translations")}
+        arrays |= {"rotations": poses.rotations, "translations": poses.translation}
         arrays |= {"K": both.cameras.K, "cam_from_world": both.cameras.cam_from_world}
         write_npz(folder / "views.npz", arrays)
     return folders
@@ -165,7 +178,7 @@ def read_sample(folder: Path) -> Sample:
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     count = len(images)
-    cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), SIZE, SIZE)
+    cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3])
     pose = jnp.asarray(arrays["rotations"]), jnp.asarray(arrays["translations"])
     views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose, jnp.zeros(count, int)))
     start = parameters_of(avatar.gaussians, 1, len(avatar.parents))
@@ -208,8 +221,11 @@ def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, 
     return jax.vjp(iterations, variables)[1](cotangents)[0]
 
 
-def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tuple[Any, Any]:
-    """Loss of one view, relative to the person's share of the image; mean squared error."""
+def view_loss(values: Any, like: Any, avatar: Any, view: Any, perceptual: Any, splat: Any) -> tuple[Any, Any]:
+    """Loss of one view, relative to the person's share of the image; (mean squared error, LPIPS).
+
+    perceptual: weight and network of LPIPS; None: without, and 0.
+    """
     drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.camera, splat)
     terms = {
         "squared": jnp.square(drawn.rgb - view.image),
@@ -218,8 +234,12 @@ def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tup
         "silhouette": jnp.abs(drawn.alpha - view.mask),
     }
     loss = sum(weight * jnp.mean(terms[name]) for name, weight in WEIGHTS.items())
+    distance = jnp.zeros(())
+    if perceptual is not None:
+        distance = lpips(perceptual[1], jnp.clip(drawn.rgb, 0, 1), view.image)
+        loss = loss + perceptual[0] * distance
     squared = jnp.mean(jnp.square(jnp.clip(drawn.rgb, 0, 1) - view.image))
-    return 0.15 * loss / jnp.mean(view.mask), squared
+    return 0.15 * loss / jnp.mean(view.mask), (squared, distance)
 
 
 @functools.cache
@@ -229,21 +249,27 @@ def view_gradient() -> Any:
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())
 
 
-def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -> list[float]:
-    """PSNR of views that are not among the photos, mean over samples, before and after each iteration."""
+def validate(variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any) -> list[list[float]]:
+    """[PSNR, LPIPS] of views that are not among the photos, mean over samples, before and after each iteration."""
     rows = []
     for folder in folders:
         sample = read_sample(folder)
         after, _ = run_iterations(variables, sample, PHOTOS, iterations, splat)
-        scored = lambda values, sample=sample: [
-            -10 * np.log10(float(view_gradient()(values, sample.start, sample.avatar, view, splat=splat)[0][1]))
-            for view in sample.views[PHOTOS:]
-        ]
-        rows.append([np.mean(scored(values)) for values in (stacked(sample.start), *after)])
-    return np.mean(rows, axis=0).round(3).tolist()
+
+        def scored(values, sample=sample):
+            found = [
+                view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)
+                for view in sample.views[PHOTOS:]
+            ]
+            return [(-10 * np.log10(float(squared)), float(distance)) for ((_, (squared, distance)), _) in found]
+
+        rows.append([np.mean(scored(values), axis=0) for values in (stacked(sample.start), *after)])
+    return np.mean(rows, axis=0).round(4).tolist()
 
 
-def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: Any, seed: tuple[int, int]) -> Any:
+def step_gradient(
+    variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any, seed: tuple[int, int]
+) -> Any:
     """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the last one."""
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
@@ -254,10 +280,8 @@ def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: A
     cotangents = []
     for i, values in enumerate(after):
         count = 2 if i == iterations - 1 else 1
-        each = [
-            view_gradient()(values, sample.start, sample.avatar, sample.views[targets[(i + j) % len(targets)]], splat=splat)[1]
-            for j in range(count)
-        ]
+        chosen = [sample.views[targets[(i + j) % len(targets)]] for j in range(count)]
+        each = [view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)[1] for view in chosen]
         cotangents.append(ROUND_WEIGHT ** (iterations - 1 - i) * sum(each) / count)
     return compiled(through_iterations)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
 
@@ -270,13 +294,15 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
     hidden = jnp.zeros((len(values), Refiner.width))
     variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3))
     if options.start:
-        new, given = variables["params"], read_refiner(options.start)["params"]
+        given = (load_refiner() if options.start == "shipped" else read_refiner(options.start))["params"]
+        new = variables["params"]
         if any(
             layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
             for layer, own in given.items()
         ):
             raise ValueError(f"{options.start}: these are not weights of the network of a round")
         variables = {"params": new | given}
+    perceptual = (options.lpips, load_lpips("alex")) if options.lpips else None
     rate = optax.warmup_cosine_decay_schedule(
         0.0, options.learning_rate, min(50, options.steps // 2), options.steps, 0.02 * options.learning_rate
     )
@@ -296,9 +322,9 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
         try:
             while (step := int(state["step"])) < options.steps:
                 if step % VALIDATE_EVERY == 0:
-                    dB = validate(state["variables"], validation, options.iterations, splat)
-                    bar.write(f"step {step}: {dB} dB before and after each iteration")
-                one = functools.partial(step_gradient, state["variables"], folders, options.iterations, splat)
+                    scores = validate(state["variables"], validation, options.iterations, perceptual, splat)
+                    bar.write(f"step {step}: {scores} PSNR, LPIPS before and after each iteration")
+                one = functools.partial(step_gradient, state["variables"], folders, options.iterations, perceptual, splat)
                 gradients = list(threads.map(one, [(step, i) for i in range(options.batch)]))
                 gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
@@ -310,8 +336,8 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
             bar.write("interrupted: the same command goes on")
     write_bytes(path, serialization.to_bytes(jax.device_get(state)))
     if int(state["step"]) == options.steps:
-        dB = validate(state["variables"], validation, options.iterations, splat)
-        print(f"step {options.steps}: {dB} dB before and after each iteration")
+        scores = validate(state["variables"], validation, options.iterations, perceptual, splat)
+        print(f"step {options.steps}: {scores} PSNR, LPIPS before and after each iteration")
         save_refiner(out / "refiner.safetensors", state["variables"])
 
 

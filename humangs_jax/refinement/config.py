@@ -22,6 +22,8 @@ MEASURED = "refinement.md"
 ITERATIONS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
 
+HEAD = ("head", "jaw", "eye")
+"""Parts of the names of the head's joints."""
 HEAD_STEPS = 500
 """They take 4 s of one core, for photos of 512 pixels."""
 
@@ -63,6 +65,8 @@ class RefineConfig:
     )
     """Steps on the head alone afterwards, where photos have 512 pixels or more, `seconds` is None or `steps` 0; 0: none. They
     move the Gaussians of the head by crops of the photos around it, and hold back what grows beyond the masks (see `head.py`)."""
+    region: tuple[str, ...] = HEAD
+    """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist", "left_index")` is a hand."""
     image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
     structural: Weight = 0.2

@@ -1,4 +1,4 @@
-"""Detail where people look: steps on the head alone, in crops of the photos around it.
+"""Detail where people look: steps on the head, or another region, alone, in crops of the photos around it.
 
 Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks, and alpha beyond a mask costs
 more than in steps on the whole person, so that little coverage grows at the silhouette.
@@ -27,8 +27,6 @@ from humangs_jax.refinement.search import BUFFERS, HOST_SETTINGS, Clock, planned
 from humangs_jax.refinement.steps import RefineState, started, update
 from humangs_jax.rendering.splat_config import SplatConfig
 
-JOINTS = ("head", "jaw", "eye")
-"""Parts of the names of the head's joints."""
 LEAST_SIDE = 512
 """Pixels of the photos' longer side from which heads show more than the iterations leave."""
 LARGEST_HEAD = 112
@@ -127,15 +125,15 @@ def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
     return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(jnp.maximum(image[1] - photo.mask, 0))
 
 
-def head_crops(avatar: Avatar, capture: Capture, image_size: int | None) -> Crops | None:
-    """Crops of the photos around the head; None if the body has none or no photo shows it. capture: of usable views."""
-    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name.lower() for part in JOINTS)]
+def head_crops(avatar: Avatar, capture: Capture, config: RefineConfig) -> Crops | None:
+    """Crops of the photos around the region; None if the body has none or no photo shows it. capture: of usable views."""
+    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name.lower() for part in config.region)]
     moved = np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
     sure = moved & (np.asarray(avatar.gaussians.opacities) > OPAQUE)
     if not sure.any():
         return None
     longest = max(capture.images.shape[1:3])
-    others = min(longest, image_size or longest)
+    others = min(longest, config.image_size or longest)
     size = min(others, LOOK)
     views = crop_to_person(capture, size)
     seen, middles, side = _squares(_pixels(avatar, views)[:, sure], views)

@@ -148,7 +148,7 @@ def refine_with_report(
     compiler, crops = ThreadPoolExecutor(1), None
     if heads:
         with clock.compiling():
-            crops = head_crops(task.avatar, capture.select(_usable(capture)), config.image_size)
+            crops = head_crops(task.avatar, capture.select(_usable(capture)), config)
         if crops is not None:  # beside the programs of the search
             own = dataclasses.replace(config, head_steps=0, iterations=1)
             compiler.submit(sharpened, task.avatar, best.state.trust, crops, own, Clock(own))
@@ -171,7 +171,7 @@ def refine_with_report(
                 compiler.shutdown()
                 begin = with_low_pass_of(result, views)
                 if len(best.used) < len(task.photos):
-                    crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config.image_size)
+                    crops = head_crops(begin, capture.select(_usable(capture)[best.used]), config)
             sharp = None if crops is None else sharpened(begin, best.state.trust, crops, config, clock)
         except KeyboardInterrupt:
             interrupted = True

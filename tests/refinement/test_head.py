@@ -12,8 +12,8 @@ from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.core.pytree import replace
 from humangs_jax.refinement import head as heads
 from humangs_jax.refinement import refine as refinement
-from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.head import JOINTS, head_crops, head_loss, shows_heads
+from humangs_jax.refinement.config import HEAD, RefineConfig
+from humangs_jax.refinement.head import head_crops, head_loss, shows_heads
 from humangs_jax.refinement.photos import crop_to_person, photos_of
 
 ALONE = RefineConfig(iterations=0, steps=0, seconds=None, head_steps=20, held_out=0.0)
@@ -32,8 +32,8 @@ def same_head_buffers(monkeypatch):
     monkeypatch.setattr(heads, "planned", lambda avatar, views: SAME)
 
 
-def of_head(avatar):
-    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name for part in JOINTS)]
+def of_head(avatar, region=HEAD):
+    columns = [i for i, name in enumerate(avatar.joint_names) if any(part in name for part in region)]
     return np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
 
 
@@ -59,14 +59,22 @@ def test_the_head_comes_closer_and_nothing_else_moves(four):
 
 def test_crops_show_the_head(four):
     avatar, capture = four
-    crops = head_crops(avatar, capture, None)
+    crops = head_crops(avatar, capture, RefineConfig())
     np.testing.assert_array_equal(crops.moved, of_head(avatar))
     assert set(np.flatnonzero(crops.moved)) <= set(crops.drawn.tolist())
     assert len(crops.views.images) == 4 and crops.views.cameras.height < HEIGHT
     assert float(crops.views.masks.mean()) > 0.2
-    larger = head_crops(avatar, capture, HEIGHT // 2)  # of the photos as they are
+    larger = head_crops(avatar, capture, RefineConfig(image_size=HEIGHT // 2))  # of the photos as they are
     assert larger.finer and not crops.finer
     np.testing.assert_allclose(larger.views.cameras.K[:, 0, 0], crops.views.cameras.K[:, 0, 0], rtol=1e-6)
+
+
+def test_another_region_of_interest(four):
+    avatar, capture = four
+    neck = ("neck", "collar")
+    crops = head_crops(avatar, capture, RefineConfig(region=neck))
+    assert of_head(avatar, neck).any()
+    np.testing.assert_array_equal(crops.moved, of_head(avatar, neck))
 
 
 def test_a_camera_that_has_the_head_behind_it_is_left_out(four):
@@ -88,7 +96,7 @@ def test_where_no_photo_shows_a_head_there_are_no_crops(four, spoil):
     else:
         away = avatar.gaussians.means + 9.0 * of_head(avatar)[:, None]
         avatar = replace(avatar, gaussians=replace(avatar.gaussians, means=away))
-    assert head_crops(avatar, capture, None) is None
+    assert head_crops(avatar, capture, RefineConfig()) is None
 
 
 @pytest.mark.parametrize(
