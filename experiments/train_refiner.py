@@ -157,7 +157,7 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
         folder.mkdir(parents=True, exist_ok=True)
         without_low_pass(reconstruct(*weights, capture)).save(folder / "avatar.npz")
         arrays = {name: to_uint8(getattr(both, name)) for name in ("images", "masks")}
-        arrays |= {"rotations": poses.rotations, "translations": poses.translation}
+        arrays |= {"rotations": np.asarray(poses.rotations), "translations": np.asarray(poses.translation)}
         arrays |= {"K": both.cameras.K, "cam_from_world": both.cameras.cam_from_world}
         write_npz(folder / "views.npz", arrays)
     return folders
