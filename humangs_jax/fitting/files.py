@@ -4,10 +4,10 @@ fit.npz, the input of a fit to keypoints and how well its result is known:
 
     set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as `humangs_jax.data.keypoints` stores them
     noise (m,)               std of the detections, pixels
-    joint_std (m, j)         of the joints' positions, metres ("deviations" in files of earlier versions)
+    joint_std (m, j)         of the joints' positions, metres
     determined (m, j)        share of the joints' rotations that the views determine
     shape_covariance (s, s)
-    places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights; not in files of earlier versions
+    places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights
 
 fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json (the report and where the scan
 is) and body_in_scan.ply.
@@ -37,11 +37,8 @@ from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
-KEYS = ("set", "names", "points", "confidences", "noise", "joint_std", "determined", "shape_covariance")
-OPTIONAL = ("places", "certainty")
-"""Keys that files of earlier versions do not have."""
-FORMER = {"joint_std": "deviations"}
-"""Keys of earlier versions."""
+FOUND = ("noise", "joint_std", "determined", "shape_covariance")
+KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
 
 
 # fit.npz -------------------------------------------------------------------------------------------------------------
@@ -75,7 +72,7 @@ def write_fit_record(path: str | Path, record: FitRecord) -> None:
         "names": np.asarray(record.names),
         "points": record.keypoints.points.astype(np.float32),
         "confidences": record.keypoints.confidences.astype(np.float32),
-        **{key: np.asarray(getattr(record, key), np.float32) for key in KEYS[4:]},
+        **{key: np.asarray(getattr(record, key), np.float32) for key in FOUND},
         "places": kind.offsets.astype(np.float32),
         "certainty": np.asarray(kind.certainty or usual_certainty(kind.names), np.float32),
     }
@@ -83,7 +80,7 @@ def write_fit_record(path: str | Path, record: FitRecord) -> None:
 
 
 def read_fit_record(path: str | Path) -> FitRecord:
-    """Read fit.npz, of earlier versions too. Raises: CaptureError naming file and key."""
+    """Read fit.npz. Raises: CaptureError naming file and key."""
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
         return _read_fit_record(path)
@@ -93,7 +90,6 @@ def _read_fit_record(path: Path) -> FitRecord:
     values, pickled = read_npz(path)
     if pickled:
         raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
-    values |= {new: values[old] for new, old in FORMER.items() if new not in values and old in values}
     for key in KEYS:
         if key not in values:
             raise CaptureError(path, key, "missing: expected a file that `humangs fit` wrote")
@@ -102,9 +98,8 @@ def _read_fit_record(path: Path) -> FitRecord:
         raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
     names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
     v, k = len(names), len(kind.names)
-    if set(OPTIONAL) <= set(values):
-        offsets = numbers(values["places"], path, "places", (k, 3))
-        kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
+    offsets = numbers(values["places"], path, "places", (k, 3))
+    kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
     points = numbers(values["points"], path, "points", (v, k, 2))
     confidences = numbers(values["confidences"], path, "confidences", (v, k))
     noise = numbers(values["noise"], path, "noise")

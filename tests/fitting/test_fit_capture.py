@@ -19,7 +19,6 @@ from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_r
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_files import render_scan_views
 from humangs_jax.io import reading
-from humangs_jax.io.npz import read_npz
 
 SIZE = 16
 FRAMES = NAMES_WITHIN_LIMITS
@@ -107,15 +106,6 @@ def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted,
         write_fitted(path, target, fitted.capture, fitted.report, fitted.record)
         np.testing.assert_array_equal(load_capture(target).betas, fitted.capture.betas)
         assert (target / "params" / "body.npz").is_file()
-
-
-@pytest.mark.slow
-def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
-    path = copied(folder[0], tmp_path)
-    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
-    kept = read_npz(path / "fit.npz")[0]["joint_std"]
-    edit_npz(path / "fit.npz", deviations=kept, joint_std=None, **dict.fromkeys(files.OPTIONAL))
-    np.testing.assert_array_equal(read_fit_record(path / "fit.npz").joint_std, fitted.record.joint_std.astype(np.float32))
 
 
 @pytest.mark.slow

@@ -4,9 +4,11 @@ import json
 import tempfile
 from pathlib import Path
 
+import dataset_files
 import honest_files as honest
 import numpy as np
 from hostile_cases import case
+from readers import AMASS
 
 from humangs_jax.body.library import save_body
 
@@ -33,6 +35,10 @@ def put(name, value, index=(0,)):
 
 def to(**values):
     return lambda arrays: arrays.update(values)
+
+
+def full(name, value, dtype=None):
+    return lambda arrays: arrays.update({name: np.full_like(arrays[name], value, dtype)})
 
 
 def cast(name, dtype):
@@ -93,7 +99,7 @@ BODIES = {
     "vertices outside": put("regressor_vertices", 99),
     "NaN in the template": put("template", np.nan),
     "NaN in the regressor": put("regressor_values", np.nan),
-    "weights of 0": lambda arrays: arrays.update(weight_values=np.zeros_like(arrays["weight_values"])),
+    "weights of 0": full("weight_values", 0),
     "a circle of parents": put("parents", 1),
     "10^6 parents": to(parents=np.zeros(10**6, np.int16)),
     "directions of another size": to(shape_directions=np.zeros((3, 9, 3), np.int16)),
@@ -104,13 +110,13 @@ for kind, change in BODIES.items():
 SMPLX = {
     "corners outside": put("f", 99),
     "NaN": put("v_template", np.nan),
-    "objects": to(v_template=np.full((9, 3), None)),
+    "objects": full("v_template", None, object),
     "another tree": put("kintree_table", 9, (0, 3)),
     "words": cast("weights", str),
     "no vertices": to(v_template=np.zeros((0, 3))),
 }
 for kind, change in SMPLX.items():
-    arrays_case(kind, "smplx npz", honest.smplx_arrays, change, 7)
+    arrays_case(kind, "smplx npz", dataset_files.model_arrays, change, 7)
 MOTION = {
     "NaN": put("poses", np.nan),
     "a rate of 0": to(mocap_framerate=0.0),
@@ -120,9 +126,8 @@ MOTION = {
     "complex numbers": cast("poses", complex),
     "another number of frames": to(trans=np.zeros((9, 3))),
 }
-amass = lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}
 for kind, change in MOTION.items():
-    arrays_case(kind, "amass", amass, change, 6)
+    arrays_case(kind, "amass", AMASS.copy, change, 6)
 arrays_case("names that are no list", "joints npz", lambda: {"points": np.zeros((2, 3))}, to(names=np.asarray("x")), 6)
 FITS = {
     "another set": to(set=np.asarray("mine")),
@@ -157,8 +162,8 @@ for kind, change in {
     "scales of 1e30": put("scales", 1e30),
     "quaternions of 1e30": put("quats", 1e30),
     "joints a light year away": put("rest_joints", 1e16),
-    "weights of 0": lambda arrays: arrays.update(skinning_weights=np.zeros_like(arrays["skinning_weights"])),
-    "weights of 1 each": lambda arrays: arrays.update(skinning_weights=np.ones_like(arrays["skinning_weights"])),
+    "weights of 0": full("skinning_weights", 0),
+    "weights of 1 each": full("skinning_weights", 1),
     "no vertices": to(rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)),
     "no joints": to(rest_joints=np.zeros((0, 3), np.float32)),
 }.items():
@@ -171,17 +176,17 @@ for kind, change in {
     arrays_case(kind, "body", body_file, change)
 for kind, change in {
     "a template of 1e38": put("v_template", 1e38),
-    "directions of 1e300": to(shapedirs=np.full((9, 3, 20), 1e300)),
-    "weights of 0": to(weights=np.zeros((9, 55))),
+    "directions of 1e300": full("shapedirs", 1e300, float),
+    "weights of 0": full("weights", 0),
     "weights of 1e38": put("weights", 1e38),
     "a regressor of 1e38": put("J_regressor", 1e38),
 }.items():
-    arrays_case(kind, "smplx npz", honest.smplx_arrays, change)
+    arrays_case(kind, "smplx npz", dataset_files.model_arrays, change)
 for value in (1e38, 1e300, 1e9):
     for key in ("rotations", "translations"):
         arrays_case(f"{key} of {value:g}", "motion npz", honest.motion_arrays, put(key, value))
     for key in ("poses", "trans"):
-        arrays_case(f"{key} of {value:g}", "amass", amass, put(key, value))
+        arrays_case(f"{key} of {value:g}", "amass", AMASS.copy, put(key, value))
 
 
 def capture_of(key, value):

@@ -16,7 +16,7 @@ from small import tetrahedron
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.motion.skeleton import shipped_joints
-from humangs_jax.fitting.files import KEYS, OPTIONAL
+from humangs_jax.fitting.files import KEYS
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.network.weights import expected_variables, save_weights
 from humangs_jax.people.subject import GENERATOR_VERSION
@@ -55,22 +55,6 @@ def written(name, data):
 
 def pixels(*shape, dtype=np.uint8):
     return np.random.default_rng(1).integers(0, 256, shape).astype(dtype)
-
-
-def smplx_arrays(n=9):
-    random = np.random.default_rng(0)
-    weights, regressor = random.uniform(size=(n, 55)), random.uniform(size=(55, n))
-    return {
-        "v_template": random.normal(size=(n, 3)),
-        "f": random.integers(0, n, size=(4, 3)).astype(np.uint32),
-        "shapedirs": random.normal(size=(n, 3, 20)).astype(np.float32),
-        "posedirs": np.zeros((n, 3, 486), np.float32),
-        "J_regressor": regressor / regressor.sum(1, keepdims=True),
-        "weights": weights / weights.sum(1, keepdims=True),
-        "kintree_table": np.stack([np.asarray(PARENTS), np.arange(55)]),
-        **{f"hands_mean{side}": np.zeros(45) for side in "lr"},
-        **{f"hands_components{side}": np.eye(45, dtype=np.float32) for side in "lr"},
-    }
 
 
 def avatar_arrays(g=6, n=4, j=3):
@@ -239,7 +223,7 @@ def fit_arrays():
         **{"determined": np.ones((2, 5), np.float32), "shape_covariance": np.eye(3, dtype=np.float32)},
         **{"places": np.zeros((17, 3), np.float32), "certainty": np.ones(17, np.float32)},
     }
-    assert set(arrays) == {*KEYS, *OPTIONAL}
+    assert set(arrays) == set(KEYS)
     return arrays
 
 
