@@ -4,29 +4,19 @@ import dataclasses
 import json
 import shutil
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_npz
 from command_line import save_tiny_avatar
+from small import random_gaussians, small_avatar
 
 from humangs_jax import cli
 from humangs_jax.avatar import reconstruct as many
+from humangs_jax.avatar.export.gaussians import save_gaussians
 from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.io.images import write_png
-
-
-def spoil_body(change):
-    def spoil(path):
-        arrays = dict(np.load(path / "body.npz"))
-        change(arrays)
-        np.savez(path / "body.npz", **arrays)
-
-    return spoil
-
-
-def spoiled(folder, path, spoil):
-    shutil.copytree(folder, path)
-    spoil(path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +43,13 @@ def things(tmp_path_factory, capture_folder):
     np.savez(path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30)
     np.savez(path / "pickled.npz", poses=np.array([{"a": 1}], dtype=object), trans=np.zeros((1, 3)))
     (path / "folder.npz").mkdir()
-    spoiled(capture_folder, path / "broken", spoil_body(lambda a: a["rotations"].__setitem__((0, 0, 0), np.nan)))
-    next((spoiled(capture_folder, path / "lacking", lambda path: None) / "images").iterdir()).unlink()
+    edit_npz(shutil.copytree(capture_folder, path / "broken") / "body.npz", rotations=lambda x: np.nan * x)
+    next((shutil.copytree(capture_folder, path / "lacking") / "images").iterdir()).unlink()
+    small_avatar().save(path / "three.npz")
+    for name, joints in (("jump", 55), ("few", 10), ("steps", 3)):
+        save_motion(path / f"{name}.npz", Motion(jnp.zeros((4, joints, 3)), jnp.zeros((4, 3)), 4.0))
+    save_gaussians(path / "splats.ply", random_gaussians())
+    (path / "a.webm").mkdir()
     (path / "file").write_text("mine")
     (path / "file.npz").write_text("mine")
     np.savez(path / "body.npz", body="makehuman")
@@ -75,6 +70,15 @@ BAD_DATA = {
     "animate me.npz --motion ten.npz": "ten.npz: poses: expected",
     "animate me.npz --motion pickled.npz": "pickled.npz: no motion: expected one of the keys",
     "animate me.npz --motion far.npz": "far.npz",
+    "animate three.npz": "rotations: expected 3 joints, got 55",
+    "animate three.npz --motion steps.npz --loop 250000000": "steps.npz: 1,000,000,000 frames",
+    "animate three.npz --motion none.npz": "none.npz",
+    "render me.npz --views 1000000000": "the limit frames is 250,000",
+    "render three.npz --capture demo_capture": "the capture's poses have 55 joints, the avatar has 3",
+    "render splats.ply --camera no.json": "no.json: no such file",
+    "render cloud.ply": "cloud.ply: element vertex: 0 of them",
+    "export me.npz --out x.ply --motion few.npz": "rotations: expected 55 joints, got 10",
+    "export me.npz --out x.ply --motion jump.npz --frames 9:": "none of the 4 frames",
     "reconstruct photo.png": "photo.png",
     "reconstruct cloud.ply": "cloud.ply",
     "reconstruct me.npz": "me.npz",
@@ -101,6 +105,34 @@ BAD_USAGE = {
     "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
     "refine me.npz someone --out me.npz": "--out me.npz: is read by this command",
     "animate me.npz --azimuth nan": "--azimuth nan: expected -36,000 to 36,000",
+    "animate me.npz --background blu": "--background 'blu': expected a color",
+    "animate me.npz --background transparent --out b.mp4": "--out b.mp4: .mp4 has no transparency",
+    "animate me.npz --out a.webm": "--out a.webm: is a folder",
+    "animate me.npz --fps 0": "--fps 0: expected",
+    "animate three.npz --motion steps.npz --start 3": "--start 3, stop 1: expected",
+    "animate three.npz --motion steps.npz --loop 0": "--loop 0: expected",
+    "render me.npz --height 100000": "--height 100000: expected",
+    "render me.npz --background transparent --out c.gif": "--out c.gif: .gif has no transparency",
+    "render me.npz --views -1": "--views -1: expected at least 1",
+    "render me.npz --exr --channels rgba,depth": "--channels 'depth': expected some of",
+    "render me.npz --exr --out b.mp4": "--exr: b.mp4 is a video",
+    "render me.npz --capture demo_capture --azimuth 3": "--azimuth: not with --capture",
+    "render me.npz --capture demo_capture --views 3": "--views: not with --capture",
+    "render me.npz --capture demo_capture --pose a": "--pose: not with --capture",
+    "render me.npz --capture demo_capture --out b.mp4": "--out b.mp4: expected a folder",
+    "render me.npz --camera transforms.json": "--camera: me.npz is an avatar",
+    "render splats.ply --exr": "--exr: splats.ply is no avatar",
+    "render splats.ply --pose a": "--pose: splats.ply is no avatar",
+    "render splats.ply --camera transforms.json --out x.mp4": "--camera: expected a folder",
+    "view me.npz --capture demo_capture": "--capture: only with --live",
+    "export me.npz --out x.ply --frame 1": "--frame 1: expected --motion and --out",
+    "export me.npz --html x.html --motion jump.npz --frames :": "--frames :: expected --motion and --out",
+    "export me.npz --out x.ply --motion jump.npz --frame 1 --frames :": "--frame 1: does not go with --frames",
+    "export me.npz --out x.glb --mesh --motion jump.npz --frame 1": "a file that holds the whole motion",
+    "export me.npz --out x.ply --mesh": "expected a name ending in .glb or .obj",
+    "export me.npz --out x.sog": "expected a name ending in .ply, .splat, .spz, .glb or .obj",
+    "export me.npz --out x.ply --motion jump.npz --frame 9": "--frame 9: jump.npz has 4 frames",
+    "export me.npz --out x.spz --rest": "--rest: x.spz has no such fields",
     "preprocess thuman in --out x --body b.npz --views 0": "--views 0",
     "animate nobody.npz --out a.txt": "--out a.txt: expected a name ending in",
     "demo --refine inf": "--refine 'inf': expected how long",
@@ -161,8 +193,8 @@ def test_what_cannot_be_meant_is_one_line_before_the_work(line, expected, said, 
 def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, monkeypatch, humangs):
     """The quick part of `check`; here the command ends after it."""
     monkeypatch.setattr(many, "reconstruct_many", lambda variables, config, captures, batch: iter([captures["turned"]()][1:]))
-    in_degrees = spoil_body(lambda arrays: arrays.update(rotations=np.degrees(arrays["rotations"])))
-    turned = spoiled(capture_folder, tmp_path / "turned", in_degrees)
+    turned = shutil.copytree(capture_folder, tmp_path / "turned")
+    edit_npz(turned / "body.npz", rotations=np.degrees)
     arguments = ("reconstruct", turned, "--out", tmp_path / "a.npz")
     _, _, err = humangs(*arguments)
     assert "warning: the poses seem to be in degrees" in err and "humangs check" in err

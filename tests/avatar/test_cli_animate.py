@@ -1,4 +1,4 @@
-"""`humangs animate`, `render`, `view`: bad options are one line and leave nothing; what is written is what was asked for."""
+"""`humangs animate`, `render`, `view`: what is written is what was asked for."""
 
 import dataclasses
 import os
@@ -13,7 +13,6 @@ from avatar_cases import two_balls
 from command_line import run
 from exr_files import read_exr
 
-from humangs_jax import cli
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.animate import Animate, Render
 from humangs_jax.data.motion import Motion, save_motion
@@ -30,51 +29,7 @@ def folder(tmp_path, monkeypatch):
     avatar.save(tmp_path / "avatar.npz")
     path = np.stack([np.zeros(12), np.zeros(12), np.linspace(0, 1, 12)], axis=-1)
     save_motion(tmp_path / "motion.npz", Motion(jnp.zeros((12, 3, 3)), jnp.asarray(path, jnp.float32), 12.0))
-    (tmp_path / "a.webm").mkdir()
-    (tmp_path / "file").write_text("mine")
     return tmp_path
-
-
-BAD = {
-    "--azimuth nan: expected": ("animate", "--azimuth", "nan"),
-    "--size -5: expected 1 to 8,192": ("animate", "--size", "-5"),
-    "--height 100000: expected": ("render", "--height", "100000"),
-    "--background 'blu': expected a color": ("animate", "--background", "blu"),
-    "--out b.mp4: .mp4 has no transparency": ("animate", "--background", "transparent", "--out", "b.mp4"),
-    "--out c.gif: .gif has no transparency": ("render", "--background", "transparent", "--out", "c.gif"),
-    "--out b.avi: expected a name ending in": ("animate", "--out", "b.avi"),
-    "--out a.webm: is a folder": ("animate", "--out", "a.webm"),
-    "--out file: is a file": ("render", "--out", "file"),
-    "--out none/b.mp4: the folder none does not exist": ("animate", "--out", "none/b.mp4"),
-    "--fps 0: expected": ("animate", "--fps", "0"),
-    "--fps nan: expected": ("render", "--fps", "nan"),
-    "--views -1: expected at least 1": ("render", "--views", "-1"),
-    "--start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),
-    "--loop 0: expected": ("animate", "--motion", "motion.npz", "--loop", "0"),
-    "motion.npz: 999,999,996 frames": ("animate", "--motion", "motion.npz", "--loop", "83333333"),
-    "the limit frames is 250,000": ("render", "--views", "1000000000"),
-    "--channels 'depth': expected some of": ("render", "--exr", "--channels", "rgba,depth"),
-    "--exr: b.mp4 is a video": ("render", "--exr", "--out", "b.mp4"),
-    "--azimuth: not with --capture": ("render", "--capture", "demo_capture", "--azimuth", "3"),
-    "--views: not with --capture": ("render", "--capture", "demo_capture", "--views", "3"),
-    "--pose: not with --capture": ("render", "--capture", "demo_capture", "--pose", "a"),
-    "--out b.mp4: expected a folder": ("render", "--capture", "demo_capture", "--out", "b.mp4"),
-    "the capture's poses have 55 joints, the avatar has 3": ("render", "--capture", "demo_capture"),
-    "none.npz": ("animate", "--motion", "none.npz"),
-    "rotations: expected 3 joints, got 55": ("animate",),
-    "--capture: only with --live": ("view", "--capture", "demo_capture"),
-}
-
-
-@pytest.mark.parametrize("message", BAD)
-def test_bad_options_are_one_line_and_nothing_is_written(message, folder, monkeypatch, capsys):
-    before = sorted(folder.rglob("*"))
-    command, *options = BAD[message]
-    code, _, error = run(monkeypatch, capsys, command, "avatar.npz", *options)
-    usage = message.startswith("--")
-    assert code == (cli.BAD_USAGE if usage else cli.BAD_DATA)
-    assert message in error and error.count("\n") == 1, error
-    assert sorted(folder.rglob("*")) == before
 
 
 def test_both_commands_have_the_options_of_a_shot(monkeypatch, capsys):

@@ -259,33 +259,6 @@ def test_numbers_that_files_cannot_hold_are_not_written(name, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["me.npz"]
 
 
-MISUSES = {
-    "--frame 1: expected --motion and --out": ["--out", "x.ply", "--frame", "1"],
-    "--frames :: expected --motion and --out": ["--html", "x.html", "--motion", "jump.npz", "--frames", ":"],
-    "--frame 1: does not go with --frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "1", "--frames", ":"],
-    "a file that holds the whole motion": ["--out", "x.glb", "--mesh", "--motion", "jump.npz", "--frame", "1"],
-    "expected a name ending in .glb or .obj": ["--out", "x.ply", "--mesh"],
-    "expected a name ending in .ply, .splat, .spz, .glb or .obj": ["--out", "x.sog"],
-    "none of the 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frames", "9:"],
-    "--frame 9: jump.npz has 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "9"],
-    "--rest: x.spz has no such fields": ["--out", "x.spz", "--rest"],
-    "rotations: expected 1 joints, got 10": ["--out", "x.ply", "--motion", "ten.npz"],
-}
-
-
-@pytest.mark.parametrize("message", MISUSES)
-def test_what_does_not_go_together_is_one_line(message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    small_file(tmp_path)
-    for name, joints in (("jump", 1), ("ten", 10)):
-        save_motion(tmp_path / f"{name}.npz", Motion(jnp.zeros((4, joints, 3)), jnp.zeros((4, 3)), 24.0))
-    with pytest.raises(SystemExit):
-        exported(monkeypatch, "me.npz", *MISUSES[message])
-    said = capsys.readouterr().err.strip()
-    assert message in said and len(said.splitlines()) == 1
-    assert not list(tmp_path.glob("x*"))
-
-
 def transformed(source, target):
     """What a program that is not ours makes of a file."""
     done = subprocess.run([str(TRANSFORM), "-w", str(source), str(target)], capture_output=True, text=True, check=False)

@@ -69,25 +69,3 @@ def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypat
     assert np.mean(expected < 0.9) > 0.05
     larger = file_cameras(tmp_path / "transforms.json", Shot(width=96, height=64))["b"]
     assert (larger.width, larger.height) == (96, 64) and float(larger.K[0, 0]) == pytest.approx(120)
-
-
-MISUSES = {
-    "--exr: a.ply is no avatar": ["a.ply", "--exr"],
-    "--pose: a.ply is no avatar": ["a.ply", "--pose", "a"],
-    "--camera: me.npz is an avatar": ["me.npz", "--camera", "transforms.json"],
-    "--camera: expected a folder": ["a.ply", "--camera", "transforms.json", "--out", "x.mp4"],
-    "no.json: no such file": ["a.ply", "--camera", "no.json"],
-    "a.ply: no PLY file": ["a.ply"],
-}
-
-
-@pytest.mark.parametrize("message", MISUSES)
-def test_what_does_not_fit_is_one_line(message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    hg.save_gaussians(tmp_path / "a.ply", ball(3))
-    if message.startswith("a.ply: no"):
-        (tmp_path / "a.ply").write_bytes(b"solid")
-    with pytest.raises(SystemExit):
-        rendered(monkeypatch, *MISUSES[message])
-    said = capsys.readouterr().err.strip()
-    assert message in said and len(said.splitlines()) == 1 and not (tmp_path / "views").exists()
