@@ -174,25 +174,6 @@ def test_without_masks_nothing_that_refines_is_tried():
 # The command -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("tune", "demo_capture"), 2, "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them"),
-        (("tune", "demo_capture", "--frame-ms", "-1"), 2, "--frame-ms -1.0: expected a positive number"),
-        (("tune", "demo_capture", "--frame-ms", "9", "--out", "tuned.txt"), 2, "expected a name ending in .json"),
-        (("reconstruct", "demo_capture", "--preset", "best", "--config", "x.json"), 2, "does not go with --preset best"),
-        (("reconstruct", "demo_capture", "--config", "missing.json"), 1, "missing.json: no such file"),
-        (("animate", "a.npz", "--config", "missing.json"), 1, "missing.json: no such file"),
-        (("render", "a.npz", "--preset", "best", "--config", "x.json"), 2, "does not go with --preset best"),
-    ],
-)
-def test_command_lines_that_cannot_be_meant(arguments, code, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    found, _, err = run(monkeypatch, capsys, *arguments)
-    assert found == code and said in err and len(err.splitlines()) == 1
-    assert not any(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     """The smallest network finds the better of two settings in a large budget, none in a tiny one; `reconstruct`, `animate` and

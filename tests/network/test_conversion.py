@@ -1,6 +1,5 @@
 import dataclasses
 import os
-import re
 
 import jax
 import network_oracle as oracle
@@ -220,9 +219,6 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     assert all(np.array_equal(*pair) for pair in leaves)
     code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", tmp_path / "again.safetensors")
     assert code == 1 and "a weights file already" in error
-    for arguments in ((path, "--out", tmp_path / "w.npz"), (path, "--out", tmp_path / "no" / "w.safetensors")):
-        code, _, error = run(monkeypatch, capsys, "convert", *arguments)
-        assert code == 2 and error.count("\n") == 1
     code, _, error = run(monkeypatch, capsys, "convert", weights, "--out", weights)
     assert code == 2 and "is read by this command" in error
     assert sorted(os.listdir(tmp_path)) == ["a.pt", "w.safetensors"]
@@ -249,20 +245,11 @@ def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
     assert np.array_equal(kernel, expected.transpose(2, 3, 1, 0))
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("w.safetensors", "the same file as --out"),
-        ("losses.pt", "--losses .*losses.pt: expected a name ending in .safetensors"),
-        ("nowhere/losses.safetensors", "--losses .*: the folder .* does not exist"),
-        ("losses.safetensors", "a.pt: no loss networks"),
-    ],
-)
-def test_losses_that_cannot_be_kept(name, message, tmp_path, monkeypatch, capsys):
+def test_losses_that_a_checkpoint_lacks_cannot_be_kept(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, oracle.random_state(Options()))
-    arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / name)
-    code, out, error = run(monkeypatch, capsys, "convert", path, *arguments)
-    assert code == (1 if "a.pt" in message else 2) and out == "" and error.count("\n") == 1 and re.search(message, error)
+    places = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / "losses.safetensors")
+    code, out, error = run(monkeypatch, capsys, "convert", path, *places)
+    assert code == 1 and out == "" and error.count("\n") == 1 and "a.pt: no loss networks" in error
     assert os.listdir(tmp_path) == ["a.pt"]
 
 

@@ -180,20 +180,6 @@ def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, m
     assert rest == [layout, "train", first] and keywords["workers"] >= 1
 
 
-@pytest.mark.parametrize(
-    "arguments", [("--subjects", "0"), ("--held-out", "-1"), ("--sequences", "--poses", "9", "--motion-frames", "8")]
-)
-def test_wrong_numbers_are_one_line(arguments, tmp_path, monkeypatch, capsys):
-    from humangs_jax import cli
-
-    monkeypatch.setattr("sys.argv", ["humangs", "synth", "--out", str(tmp_path / "new"), *arguments])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2 and error.count("\n") == 1 and arguments[-2] in error
-    assert not (tmp_path / "new").exists()
-
-
 # Nobody of the test split can be drawn in training: all ways to people go through seeds of a split ----------------------
 
 

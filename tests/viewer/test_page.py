@@ -128,25 +128,6 @@ def test_export_of_a_page_writes_nothing_else(avatar_file, tmp_path, monkeypatch
     assert {path.name for path in tmp_path.iterdir()} == {"me.npz", "p.html"}
 
 
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (("export", "me.npz", "--html", "p.txt"), r"--html p\.txt: expected a name ending in \.html"),
-        (("export", "me.npz", "--html", "no/p.html"), r"--html no/p\.html: the folder no does not exist"),
-        (("export", "me.npz", "--html", "p.html", "--motion", "walk52.npz"), "rotations: expected 3 joints, got 52"),
-        (("view", "nobody.npz"), r"nobody\.npz: no such file"),
-        (("view", "me.npz", "--port", "99999"), "--port 99999"),
-    ],
-)
-def test_bad_input_gets_one_line(command, message, avatar_file, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    save_motion(tmp_path / "walk52.npz", Motion(jnp.zeros((2, 52, 3)), jnp.zeros((2, 3))))
-    before = set(tmp_path.iterdir())
-    code, _, err = run(monkeypatch, capsys, *command)
-    assert code == (2 if "--" in message else 1) and err.count("\n") == 1 and re.search(message, err), err
-    assert set(tmp_path.iterdir()) == before
-
-
 def test_view_opens_the_browser_and_ends_quietly(avatar_file, monkeypatch, capsys):
     opened = []
 
