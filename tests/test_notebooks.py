@@ -4,6 +4,8 @@ What a notebook keeps to, so that these tests can look:
 
 - A number in digits in the prose stands in an output of the notebook or in its code. With a unit it is a result: it
   stands with that unit in an output. "Some", "about" allow zeros at its end. Results are not written in words ("two fifths").
+- A cell of code that takes more than `QUICK` seconds of CPU begins with `# about N s on two cores`. Its metadata has the seconds,
+  as `cpu_seconds`: whoever runs a notebook anew measures them. Two cores take between half of them and all.
 - The first cell ends with how long the notebook takes, a key of `DURATIONS`; the last output has the seconds.
 - Pictures of people are drawn by `pictures`, which frames each in `FRAME`: the whole person lies inside of the frame.
 - What it reads of docs/ is part of the package.
@@ -36,6 +38,9 @@ IN_WORDS = re.compile(
 )
 DURATIONS = {"About a minute on a CPU with two cores.": (20, 140), "A few minutes on a CPU with two cores.": (60, 600)}
 """Seconds of CPU time, between which the committed run lies: two cores take between one and half of them."""
+
+QUICK, LONGEST_BUDGET = 2.0, 3.0
+"""Seconds of CPU of a cell without a budget; a budget over the seconds of the cell, at most (of the least budget, 3 s: less)."""
 
 PICTURES = {
     "ablations": 3,
@@ -76,7 +81,8 @@ def printed(notebook):
 
 def images(notebook):
     """Arrays (h, w, 3) of all figures, levels 0 to 255."""
-    found = [out["data"]["image/png"] for out in outputs(notebook) if "image/png" in out.get("data", {})]
+    kinds = ("image/jpeg", "image/png")
+    found = [out["data"][kind] for out in outputs(notebook) for kind in kinds if kind in out.get("data", {})]
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(x))).convert("RGB"), np.int32) for x in found]
 
 
@@ -118,7 +124,7 @@ def runs(line):
 
 def framed(image):
     """What lies inside of each frame of a figure."""
-    line = np.all(abs(image - FRAME) <= 4, axis=-1)
+    line = np.all(abs(image - FRAME) <= 12, axis=-1)  # of a JPEG
     rows, found = {i: runs(row) for i, row in enumerate(line) if row.sum() >= SMALLEST}, []
     for top in rows:
         for left, right in rows[top]:
@@ -166,6 +172,22 @@ def test_time_of_the_prose_is_the_time_of_the_run(committed):
     least, most = next(bounds for said, bounds in DURATIONS.items() if first.endswith(said))
     took = re.search(r"this notebook took \d+ s, (\d+) s of CPU", "".join(outputs(notebook)[-1]["text"]))
     assert took and least <= int(took[1]) <= most
+
+
+def test_cells_say_how_long_they_take(committed):
+    _, notebook = committed
+    total, code = 0.0, [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    if not any("cpu_seconds" in cell["metadata"] for cell in code):
+        pytest.skip("was run before cells were timed")
+    for cell in code:
+        took, first = cell["metadata"]["cpu_seconds"], "".join(cell["source"]).splitlines()[0]
+        budget = re.fullmatch(r"# about (\d+) s on two cores", first)
+        assert (budget is not None) == (took > QUICK), f"{took} s: {first}"
+        if budget is not None:
+            assert took / 2 <= int(budget[1]) <= LONGEST_BUDGET * took
+        total += took
+    spent = re.search(r"(\d+) s of CPU", "".join(outputs(notebook)[-1]["text"]))
+    assert spent and abs(int(spent[1]) - total) <= 0.1 * total + 5, "of another run"
 
 
 def test_people_lie_inside_of_their_pictures(committed):
