@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from evaluation_cases import capture_from, random_lpips, random_views
+from evaluation_cases import capture_from, ellipse, random_lpips, random_views
 from rounding import bound
 from skimage.metrics import structural_similarity
 
@@ -114,6 +114,18 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
         union = (alpha > 0.5) | (masks > 0.5)
         assert row["iou"] == pytest.approx(((alpha > 0.5) & (masks > 0.5)).sum() / union.sum())
         assert row["foreground"] == pytest.approx(masks.mean()) and row["lpips_alex"] is None
+
+
+@pytest.mark.parametrize("name", ["giga", "lhm++"])
+def test_soft_masks_count_once(name, monkeypatch):
+    """A person of one color, cut out by the true mask, is the photo on that background."""
+    seen = []
+    monkeypatch.setattr(scores, "pair_scores", lambda *pair: seen.append(pair) or {})
+    monkeypatch.setattr(scores, "person_scores", lambda *_: ({}, np.zeros((1, 1), bool)))
+    color, mask = np.asarray([0.2, 0.5, 0.9], np.float32), ellipse(40, 32)
+    photo = color * mask[..., None] + 1 - mask[..., None]
+    list(scores.score_views((0 * photo + color)[None], capture_from(photo[None], mask[None]), PROTOCOLS[name]))
+    np.testing.assert_allclose(seen[0][0], seen[0][1], atol=1e-6)
 
 
 @pytest.mark.slow
