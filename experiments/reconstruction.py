@@ -29,7 +29,8 @@ from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.network.humangs import apply_humangs, needed_tokens
+from humangs_jax.network.encoder import needed_tokens
+from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.weights import expected_variables, load_weights
 from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
@@ -78,8 +79,9 @@ def benchmark_inputs(config: Any, views: int, size: int) -> Any:
 
 def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
     """(configuration for foreground tokens with room for these photos, tokens that the person touches, their share)."""
-    touched = int(jax.jit(needed_tokens, static_argnames="config")(inputs, config))
-    patches = int(np.prod(inputs.images.shape[:3])) // config.architecture.encoder.patch_size**2
+    patch = config.architecture.encoder.patch_size
+    touched = int(needed_tokens(inputs.foreground, inputs.view_count, patch))
+    patches = int(np.prod(inputs.images.shape[:3])) // patch**2
     config = config.with_runtime(tokens="foreground", token_capacity=round_up(touched))
     return config, touched, touched / patches
 

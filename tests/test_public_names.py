@@ -1,5 +1,6 @@
 """The names of `import humangs_jax as hg`: all there, and none imported before it is used."""
 
+import re
 import subprocess
 import sys
 
@@ -29,19 +30,30 @@ def test_there_are_at_most_fifty():
 
 
 USER = """
-import jax
 import humangs_jax as hg
+variables, config = hg.load_weights()
 capture = hg.load_capture("photos")
-avatar = hg.reconstruct(*hg.load_weights(), capture)
-reveal_type(hg.render)
-reveal_type(hg.animate(avatar, capture.pose(0)))
-hg.render(avatar)
+avatar = hg.refine(hg.reconstruct(variables, config, capture), capture, steps=0)
+gaussians = hg.animate(avatar, capture.pose(0))
+splat = hg.plan_buffers(gaussians, capture.cameras[0])
+image = hg.render(gaussians, capture.cameras[0], splat).rgb
+ablation = hg.ablate("tiny", {"no token": {"model.architecture.encoder.transformer.class_token": False}})
+gain = ablation.rows[0].difference
 """
+USED = ("load_weights", "load_capture", "reconstruct", "refine", "animate", "plan_buffers", "render")
 
 
-def test_type_checkers_see_functions(tmp_path):
-    (tmp_path / "user.py").write_text(USER)
+def test_type_checkers_know_what_everything_is(tmp_path):
+    names = [*re.findall(r"^(\w+)(?:, (\w+))? =", USER, re.MULTILINE), *((f"hg.{name}", "") for name in USED)]
+    shown = [f"reveal_type({name})" for pair in names for name in pair if name]
+    (tmp_path / "user.py").write_text("\n".join([USER, *shown, "hg.render(avatar)"]))
     command = ["ty", "check", "--python", sys.prefix, "--output-format", "concise", "user.py"]
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    for line in ("gaussians: Gaussians, camera: Camera", "Revealed type: `Gaussians`", "Expected `Gaussians`, found `Avatar`"):
-        assert line in text, text
+    arrays_of_numpy = "ndarray[tuple[Any, ...], dtype[Any]]"
+    types = [each.replace(arrays_of_numpy, "ndarray") for each in re.findall(r"Revealed type: `(.*)`", text)]
+    assert len(types) == len(shown), text
+    vague = [
+        each for each in types if re.search(r"Unknown|Any\b|object", each.replace("ndarray[tuple[Any, ...], dtype[Any]]", ""))
+    ]
+    assert not vague, vague
+    assert "Array" in types and "float" in types and "Expected `Gaussians`, found `Avatar`" in text, text

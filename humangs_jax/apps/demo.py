@@ -46,8 +46,8 @@ VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
 
 
 def run_demo(
-    out: str | os.PathLike,
-    weights: str | os.PathLike | None = None,
+    out: str | os.PathLike[str],
+    weights: str | os.PathLike[str] | None = None,
     frame_size: int = 256,
     refine: RefineConfig | None = None,
     settings: Settings | None = None,
@@ -121,7 +121,7 @@ class _Demo:
     """
 
     out: Path
-    weights: str | os.PathLike | None
+    weights: str | os.PathLike[str] | None
     frame_size: int
     refine: RefineConfig | None
     settings: Settings

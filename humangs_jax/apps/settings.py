@@ -162,12 +162,12 @@ def reconstruct_with(
     return jax.block_until_ready(avatar)
 
 
-def save_settings(path: str | os.PathLike, settings: Settings, **about: Any) -> None:
+def save_settings(path: str | os.PathLike[str], settings: Settings, **about: Any) -> None:
     """Write settings as JSON, with what else is to be known about them. Raises: OSError."""
     write_json(path, {"kind": KIND, "settings": parse_json(config_to_json(settings)), **about})
 
 
-def load_settings(path: str | os.PathLike) -> Settings:
+def load_settings(path: str | os.PathLike[str]) -> Settings:
     """Settings that `save_settings` has written. Raises: FileNotFoundError; FileError naming the file and what is wrong."""
     with reading(path, "settings file"):
         content = parse_json(read_text(path))

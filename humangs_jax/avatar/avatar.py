@@ -92,7 +92,7 @@ class Avatar(Batchable):
         gaussians = jax.tree.map(lambda x: x[index], self.gaussians)
         return replace(self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light)
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write one compressed `.npz` (no pickle); it appears whole or not at all.
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the Gaussians are deformed, as
@@ -124,7 +124,7 @@ class Avatar(Batchable):
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> "Avatar":
+    def load(cls, path: str | os.PathLike[str]) -> "Avatar":
         """Read what `save` wrote.
 
         Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is no avatar of this

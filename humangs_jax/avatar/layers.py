@@ -65,7 +65,7 @@ class ExrLayers:
 
 
 def write_views(
-    out: str | os.PathLike,
+    out: str | os.PathLike[str],
     avatar: Avatar,
     poses: BodyPose,
     cameras: Camera,
@@ -139,7 +139,7 @@ def exr_view(
     return dataclasses.replace(plain, depth=depth, channels=channels, attributes=attributes)
 
 
-def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: Iterable[Rendering]) -> None:
+def write_renderings_exr(path: str | os.PathLike[str], cameras: Camera, renderings: Iterable[Rendering]) -> None:
     """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the camera, one part per view."""
     each = enumerate(zip(cameras, renderings, strict=True))
     write_exr(Path(path), [_plain_view(f"view_{i:03d}", camera, rendering) for i, (camera, rendering) in each])

@@ -16,7 +16,7 @@ from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
-from humangs_jax.core.array_types import Array, Int, PyTree
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -36,8 +36,9 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.network.humangs import apply_humangs, needed_tokens
-from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs
+from humangs_jax.network.encoder import needed_tokens
+from humangs_jax.network.humangs import apply_humangs
+from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs, Variables
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
 from humangs_jax.rendering.mesh.position_map import vertex_normals
@@ -50,7 +51,7 @@ BATCH = 8
 
 
 @checked_arguments
-def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
+def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
     Photos are brought to the network's image size, their exposure is made equal, and views whose mask does not show the person
@@ -82,13 +83,13 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
-    _check_posed(inputs, "capture")
-    avatar, _ = _assemble_compiled(variables, fit_buffers(inputs, config), body, views, inputs)
+    _check_posed(inputs.posed_vertices, "capture")
+    avatar, _ = _reconstruct(variables, fit_buffers(inputs, config), body, views, inputs)
     return replace(avatar, light=None) if turned else avatar
 
 
 @checked_arguments
-def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
+def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
 
     A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people.
@@ -123,7 +124,7 @@ class Reconstructed(NamedTuple):
 
 
 def reconstruct_many(
-    variables: PyTree, config: HumanGSConfig, captures: Mapping[str, Callable[[], Capture]], batch: int | None = None
+    variables: Variables, config: HumanGSConfig, captures: Mapping[str, Callable[[], Capture]], batch: int | None = None
 ) -> Iterator[Reconstructed]:
     """Yields the avatar of each capture, in their order; `batch` captures at a time are read and reconstructed by one `vmap`. A
     capture that cannot be used does not stop the others.
@@ -159,7 +160,7 @@ def _loaded(name: str, load: Callable[[], Capture]) -> Reconstructed:
         return Reconstructed(name, None, None, error)
 
 
-def _alone(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar | Exception:
+def _alone(variables: Variables, config: HumanGSConfig, capture: Capture) -> Avatar | Exception:
     try:
         return reconstruct(variables, config, capture)
     except ValueError as error:
@@ -222,7 +223,7 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
         subjects.append(replace(views, betas=betas, displacement=displaced))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
-    _check_posed(inputs, "captures")
+    _check_posed(inputs.posed_vertices, "captures")
     return body, batch, fit_buffers(inputs, config), turned
 
 
@@ -243,13 +244,15 @@ def displaces(config: HumanGSConfig) -> bool:
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
-    capacity = 0 if config.tokens == "all" else round_up(int(_needed_tokens(inputs, config)))
+    patch, capacity = config.architecture.encoder.patch_size, 0
+    if config.tokens != "all":
+        capacity = round_up(int(needed_tokens(inputs.foreground, inputs.view_count, patch)))
     return config.with_runtime(token_capacity=capacity)
 
 
 @checked_arguments
 def reconstruct_views(
-    variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
+    variables: Variables, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `reconstruct`: one subject's views to an avatar. Batch it with `jax.vmap`.
 
@@ -283,8 +286,12 @@ def reconstruct_views(
 
 
 @jax.jit
-def _reconstruct(variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews) -> tuple[Avatar, Int[Array, ""]]:
-    return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
+def _reconstruct(
+    variables: Variables, config: HumanGSConfig, body: BodyModel, views: SubjectViews, inputs: HumanGSInputs | None = None
+) -> tuple[Avatar, Int[Array, ""]]:
+    inputs = prepare_inputs(body, views, config) if inputs is None else inputs
+    outputs, _ = apply_humangs(variables, inputs, config)
+    return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
 
 
 def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig) -> Avatar:
@@ -310,7 +317,10 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config
 
 def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> Avatar:
     """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
-    conventions, avatar = config.conventions, make_avatar(outputs, body, subject_rest(body, views), config)
+    conventions, avatar = (
+        config.conventions,
+        make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config),
+    )
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
         avatar = with_spread_weights(avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach)
     if conventions.light and outputs.skinning_weights is None:
@@ -365,20 +375,8 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
-def _assemble(
-    variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews, inputs: HumanGSInputs
-) -> tuple[Avatar, Int[Array, ""]]:
-    outputs, _ = apply_humangs(variables, inputs, config)
-    return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
-
-
 def _prepare_subjects(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     return jax.lax.map(lambda views: prepare_inputs(body, views, config), batch)
-
-
-def _most_needed(inputs: HumanGSInputs, config: HumanGSConfig) -> Array:
-    count = lambda subject: needed_tokens(subject, config)
-    return jnp.max(jax.vmap(count)(inputs)) if inputs.images.ndim == 5 else count(inputs)
 
 
 def _check(capture: Capture, name: str) -> None:
@@ -412,10 +410,10 @@ def _check(capture: Capture, name: str) -> None:
     check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
 
 
-def _check_posed(inputs: HumanGSInputs, name: str) -> None:
+def _check_posed(vertices: Float[Array, "*b v n 3"], name: str) -> None:
     """The other arrays of a body are large, and each of them moves vertices."""
     try:
-        check_values(f"reconstruct: {name}", {"the posed vertices": (inputs.posed_vertices, FINITE)})
+        check_values(f"reconstruct: {name}", {"the posed vertices": (vertices, FINITE)})
     except ValueError as error:
         raise ValueError(f"{error}; are the arrays of its body finite?") from error
 
@@ -426,7 +424,5 @@ def _equal(body: BodyModel, other: BodyModel) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(body), jax.tree.leaves(other), strict=True))
 
 
-_assemble_compiled = jax.jit(_assemble)
 _prepare = jax.jit(prepare_inputs)
 _prepare_batch = jax.jit(_prepare_subjects)
-_needed_tokens = jax.jit(_most_needed)

@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import os
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,8 +30,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
 """Not checked: those of numpy and JAX do as well."""
-SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable}
-"""What lists of something may be; what is in them is not checked."""
+SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable, os.PathLike: os.PathLike}
+"""What lists and paths of something may be; what is in them is not checked."""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",

@@ -19,7 +19,7 @@ LARGEST = 2 << 30
 """Bytes; the files that were not used for longest are deleted beyond. JAX's own limit needs the package `filelock`."""
 
 
-def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None:
+def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of processor.
 
     Programs call it once, before the first computation; the library never does. JAX is not imported here: it finds the folder

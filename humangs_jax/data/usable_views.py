@@ -54,7 +54,7 @@ def usable_indices(capture: Capture) -> list[int]:
 
 def unusable_views(capture: Capture) -> dict[int, str]:
     """The views whose mask is empty or hardly meets the posed body, and which of the two."""
-    found = dict.fromkeys(empty_views(capture), "the mask is empty")
+    found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
         return found
     apart = [i for i, share in enumerate(shares_on_masks(capture)) if share < LEAST_SHARE and i not in found]
@@ -62,10 +62,9 @@ def unusable_views(capture: Capture) -> dict[int, str]:
     return dict(sorted(found.items()))
 
 
-def empty_views(capture: Capture) -> list[int]:
+def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
     """The views whose mask shows nobody."""
-    masks = () if capture.masks is None else capture.masks
-    return [i for i, mask in enumerate(masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
+    return [i for i, mask in enumerate(() if masks is None else masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
 
 
 def shares_on_masks(capture: Capture) -> list[float]:

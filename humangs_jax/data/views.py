@@ -138,12 +138,10 @@ def _remeshed(
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 
-def subject_rest(body: BodyModel, views: SubjectViews) -> RestBody:
+def subject_rest(body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None) -> RestBody:
     """The person's body in the T-pose; a displacement does not move the joints."""
-    rest = shape_body(body, views.betas)
-    if views.displacement is None:
-        return rest
-    return replace(rest, vertices=rest.vertices + views.displacement)
+    rest = shape_body(body, betas)
+    return rest if displacement is None else replace(rest, vertices=rest.vertices + displacement)
 
 
 @checked_arguments
@@ -152,7 +150,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
 
     Pure and jittable; nothing here is differentiated with respect to the body.
     """
-    rest = subject_rest(body, views)
+    rest = subject_rest(body, views.betas, views.displacement)
 
     def pose_view(rotations: Float[Array, "j 3"], translation: Float[Array, "3"]) -> Float[Array, "n 3"]:
         return pose_body(body, rest, BodyPose(rotations, translation)).vertices

@@ -223,11 +223,11 @@ class Evaluation:
     def write(
         self,
         *,
-        json: str | os.PathLike | None = None,
-        html: str | os.PathLike | None = None,
-        csv: str | os.PathLike | None = None,
-        markdown: str | os.PathLike | None = None,
-        latex: str | os.PathLike | None = None,
+        json: str | os.PathLike[str] | None = None,
+        html: str | os.PathLike[str] | None = None,
+        csv: str | os.PathLike[str] | None = None,
+        markdown: str | os.PathLike[str] | None = None,
+        latex: str | os.PathLike[str] | None = None,
     ) -> None:
         """Write all that is named, or nothing: all numbers; the page; a line an image; tables of people. Raises: OSError."""
         texts = {
@@ -369,7 +369,7 @@ def _score_person(
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
     """The predictions of views whose true mask shows somebody: white compared with white would raise the mean."""
-    empty = set(empty_views(case.truth)) & set(predicted.views)
+    empty = set(empty_views(case.truth.masks)) & set(predicted.views)
     if not empty:
         return predicted
     names = ", ".join(case.truth.names[i] for i in sorted(empty))

@@ -27,12 +27,12 @@ TOLD = 12
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?")
 
 
-def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file. Raises: OSError."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
-def write_text(path: str | os.PathLike, text: str) -> None:
+def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a file in UTF-8, but for names of files whose bytes are no UTF-8: these stay. Raises: OSError."""
     write_bytes(path, encoded(text))
 
@@ -45,17 +45,17 @@ def encoded(text: str) -> bytes:
         return text.encode("utf-8", "backslashreplace")
 
 
-def write_texts(texts: Mapping[str | os.PathLike, str]) -> None:
+def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
     """Write files in UTF-8, all of them or none. Raises: OSError."""
     replace_files({path: functools.partial(Path.write_bytes, data=encoded(text)) for path, text in texts.items()})
 
 
-def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> None:
+def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
     """`replace_files` of one file."""
     replace_files({path: write})
 
 
-def replace_files(writers: Mapping[str | os.PathLike, Callable[[Path], object]]) -> None:
+def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], object]]) -> None:
     """Calls write(temporary) for each path, which makes that file; then all are renamed to their paths at once.
 
     If one of them cannot be written, none appears. Temporary names have the same suffix.
@@ -78,7 +78,7 @@ def replace_files(writers: Mapping[str | os.PathLike, Callable[[Path], object]])
                     temporary.replace(path)
 
 
-def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
+def replace_folder(folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str) -> None:
     """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one is replaced.
 
     The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
@@ -146,7 +146,10 @@ def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
 
 
 def check_replaceable(
-    folder: str | os.PathLike, overwrite: bool = True, mark: str | None = None, inputs: Iterable[str | os.PathLike | None] = ()
+    folder: str | os.PathLike[str],
+    overwrite: bool = True,
+    mark: str | None = None,
+    inputs: Iterable[str | os.PathLike[str] | None] = (),
 ) -> None:
     """Whether a folder can be replaced, to be asked before the work begins.
 
@@ -181,14 +184,14 @@ def check_replaceable(
         raise ValueError(f"{problem}, which deletes {contents(folder)}")
 
 
-def contents(folder: str | os.PathLike) -> str:
+def contents(folder: str | os.PathLike[str]) -> str:
     """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
     entries = _entries(folder)
     told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
     return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
 
 
-def _entries(folder: str | os.PathLike) -> list[str]:
+def _entries(folder: str | os.PathLike[str]) -> list[str]:
     """Names in a folder, sorted; none if it does not exist (any more: another process may be replacing it)."""
     try:
         return sorted(os.listdir(folder))
@@ -203,7 +206,9 @@ def _told(entry: Path) -> str:
     return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
-def add_files(folder: str | os.PathLike, write: Callable[[Path], object], *, without: Iterable[str | os.PathLike] = ()) -> None:
+def add_files(
+    folder: str | os.PathLike[str], write: Callable[[Path], object], *, without: Iterable[str | os.PathLike[str]] = ()
+) -> None:
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
     The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
@@ -234,7 +239,7 @@ def add_files(folder: str | os.PathLike, write: Callable[[Path], object], *, wit
 
 
 @contextlib.contextmanager
-def only_writer(folder: str | os.PathLike, *, replaced: bool = False) -> Generator[None]:
+def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
     """Keeps other processes out of a folder that one writes to for long. The lock ends with the process, however that ends.
 
     Where there are no locks (Windows, some network disks), nothing is checked.
@@ -289,7 +294,7 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
         raise
 
 
-def check_writable(path: str | os.PathLike) -> None:
+def check_writable(path: str | os.PathLike[str]) -> None:
     """Whether a file, or a folder with all above it, can be made, to be asked before the work begins.
 
     Raises: FileNotFoundError, NotADirectoryError or PermissionError, which are OSErrors, naming `path`.

@@ -140,7 +140,7 @@ class GlbWriter:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def write(self, path: str | os.PathLike, document: dict[str, Any]) -> None:
+    def write(self, path: str | os.PathLike[str], document: dict[str, Any]) -> None:
         """Write the file with a glTF document to which arrays, buffer and `asset` are added. It appears whole or not at all."""
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document

@@ -112,7 +112,7 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
     return array
 
 
-def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any], compressed: bool = True) -> None:
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True) -> None:
     """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at all. Raises: OSError."""
     save = np.savez_compressed if compressed else np.savez
     converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}

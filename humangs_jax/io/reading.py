@@ -218,7 +218,7 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
 # Opening -------------------------------------------------------------------------------------------------------------
 
 
-def open_file(path: str | os.PathLike, limit: str = "file_bytes") -> BinaryIO:
+def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> BinaryIO:
     """Open a file whose size is within a limit. No devices and no pipes: these have no end.
 
     Raises: OSError; Refused.
@@ -232,13 +232,13 @@ def open_file(path: str | os.PathLike, limit: str = "file_bytes") -> BinaryIO:
     return open(path, "rb")
 
 
-def read_bytes(path: str | os.PathLike, limit: str = "file_bytes") -> bytes:
+def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes:
     """The bytes of a file. Raises: as `open_file`."""
     with open_file(path, limit) as file:
         return file.read()
 
 
-def walk(folder: str | os.PathLike, skip: Callable[[Path], bool] = lambda folder: False) -> Generator[Path]:
+def walk(folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False) -> Generator[Path]:
     """The files in a folder and in the folders in it, but for names that begin with a dot and folders to `skip`.
 
     Each folder is looked at once, however many links lead to it. Links that lead out are not followed, unless the limit
@@ -282,7 +282,7 @@ def check_unpacked(size: int, unpacked: int) -> None:
         )
 
 
-def inside(folder: str | os.PathLike, name: str, photo: bool = False) -> Path:
+def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Path:
     """The path `folder / name` that a file in the folder names, if it lies in there after symbolic links are followed.
 
     Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie elsewhere.
@@ -306,7 +306,7 @@ def inside(folder: str | os.PathLike, name: str, photo: bool = False) -> Path:
 T = TypeVar("T")
 
 
-def read_text(path: str | os.PathLike, limit: str = "text_bytes") -> str:
+def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
     """The text of a file in UTF-8, with or without a byte order mark.
 
     Raises: FileNotFoundError; FileError if it cannot be read, is too large or is not text.
@@ -347,7 +347,7 @@ def _containers(value: Any) -> list[Any]:
     return [item for item in values if isinstance(item, list | dict)]
 
 
-def read_configuration(cls: type[T], path: str | os.PathLike) -> T:
+def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
     """A configuration of class `cls` from its JSON, see `core.configuration`. Raises: FileNotFoundError; FileError."""
     with reading(path, "configuration"):
         try:
@@ -356,7 +356,7 @@ def read_configuration(cls: type[T], path: str | os.PathLike) -> T:
             raise Refused(str(error)) from error
 
 
-def write_json(path: str | os.PathLike, value: Any, indent: int | None = 1) -> None:
+def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:
     """Write a JSON file, whole or not at all. Raises: TypeError for what JSON cannot hold; OSError."""
     write_text(path, json_text(value, indent))
 
@@ -366,7 +366,7 @@ def json_text(value: Any, indent: int | None = 1) -> str:
     return json.dumps(value, indent=indent) + "\n"
 
 
-def read_json(path: str | os.PathLike) -> Any:
+def read_json(path: str | os.PathLike[str]) -> Any:
     """The value in a JSON file. Raises: FileNotFoundError; FileError, naming file and line."""
     with reading(path, "JSON file"):
         return parse_json(read_text(path))

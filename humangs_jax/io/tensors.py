@@ -206,7 +206,7 @@ def everything(key: str) -> bool:
     return True
 
 
-def read_torch_file(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
+def read_torch_file(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
     """The tensors of the state dict in a file whose name is wanted, and how many others there are.
 
     bfloat16 comes as float32, everything else as it is stored.
@@ -312,7 +312,7 @@ def _read_tensors(tensors: dict[str, _Tensor], size: int, read: Callable[[str, _
     return {key: arrays[key] for key in tensors}
 
 
-def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
+def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
     """The tensors whose name is wanted, and how many others the file has. Nothing in the file is run.
 
     Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for more than tensors.
@@ -320,14 +320,14 @@ def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[
     return read_safetensors(path, wanted)[:2] if is_safetensors(path) else read_torch_file(path, wanted)
 
 
-def is_safetensors(path: str | os.PathLike) -> bool:
+def is_safetensors(path: str | os.PathLike[str]) -> bool:
     """Whether a file begins as safetensors files do: with the length of a JSON object, and its brace."""
     with reading(path, "file of tensors"), open_file(path) as file:
         start = file.read(9)
     return start[8:] == b"{" and struct.unpack("<Q", start[:8])[0] < 1 << 32
 
 
-def read_safetensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int, dict[str, str]]:
+def read_safetensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int, dict[str, str]]:
     """The tensors whose name is wanted, how many others the file has, and the strings in its header.
 
     Raises: FileNotFoundError; FileError.
@@ -351,7 +351,7 @@ COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b")
 """How zlib's streams and gzip's begin, in which joblib writes."""
 
 
-def read_values(path: str | os.PathLike) -> Any:
+def read_values(path: str | os.PathLike[str]) -> Any:
     """What a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts, lists and what `as_array` takes.
 
     Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.

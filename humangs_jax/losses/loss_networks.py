@@ -52,7 +52,7 @@ PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."
 """Where the released checkpoint keeps its loss networks, under `LOSS_PREFIX`."""
 
-Path = str | os.PathLike
+Path = str | os.PathLike[str]
 Tensors = dict[str, np.ndarray]
 
 

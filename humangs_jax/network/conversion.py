@@ -146,7 +146,7 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
     return {key: tensor.shape for key, tensor in to_release(empty).items()}
 
 
-def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
+def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
     """Tensors of a checkpoint in any format of `tensor_file`, and how many of the loss networks were skipped.
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
@@ -250,7 +250,7 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
         raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such tensors)")
 
 
-def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> Converted:
+def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None) -> Converted:
     """A released checkpoint as float32 variables, with the configuration that its shapes tell.
 
     head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file cannot be read or
@@ -260,7 +260,7 @@ def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> C
         return _load_checkpoint(path, head_width)
 
 
-def _load_checkpoint(path: str | os.PathLike, head_width: int | None) -> Converted:
+def _load_checkpoint(path: str | os.PathLike[str], head_width: int | None) -> Converted:
     state, skipped = read_state_dict(path)
     try:
         config = infer_config(state, head_width)

@@ -8,13 +8,14 @@ is the horizontal texture coordinate. Positions in [-1, 1] span a plane from the
 last one (`align_corners=True`); outside are zeros.
 """
 
+import functools
 from typing import Any, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.configuration import Patch, Side, Width, configuration, knob, part
 from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.maps import sample_bilinear
@@ -118,7 +119,7 @@ class PatchTransformer(Encoder):
         dtype, present = run.runtime.compute_dtype, inputs.view_count
         packing, dropped, count = None, jnp.zeros((), jnp.int32), None if present is None else present * height * width
         if run.tokens == "foreground":
-            touched = touched_patches(inputs, self.patch_size)
+            touched = touched_patches(inputs.foreground, present, self.patch_size)
             packing = pack_patches(touched, min(run.runtime.token_capacity or len(touched), len(touched)))
             dropped, count = jnp.sum(touched, dtype=jnp.int32) - packing.count, packing.count
             patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
@@ -171,7 +172,16 @@ def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
     return jnp.concatenate([inputs.images, waves, jnp.zeros_like(inputs.images)], axis=-1)
 
 
-def touched_patches(inputs: HumanGSInputs, patch_size: int) -> Bool[Array, " p"]:
-    """Which patches of all views the foreground touches."""
-    foreground = inputs.foreground & inputs.present[:, None, None]
+def touched_patches(foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int) -> Bool[Array, " p"]:
+    """Which patches of all views the foreground touches; views beyond `view_count` are padding."""
+    if view_count is not None:
+        foreground &= (jnp.arange(len(foreground)) < view_count)[:, None, None]
     return jnp.any(patchify(foreground[..., None].astype(jnp.float32), patch_size) > 0, axis=(1, 2))
+
+
+@functools.partial(jax.jit, static_argnames="patch_size")
+def needed_tokens(foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int) -> Int[Array, ""]:
+    """The token capacity that photos need: patches that the foreground touches. Of a batch, the largest."""
+    count = lambda *subject: jnp.sum(touched_patches(*subject, patch_size), dtype=jnp.int32)
+    batched = foreground.ndim == 4
+    return jnp.max(jax.vmap(count)(foreground, view_count)) if batched else count(foreground, view_count)

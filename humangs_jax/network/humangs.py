@@ -16,18 +16,18 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose, Texels
-from humangs_jax.core.array_types import Int, Key, PyTree
+from humangs_jax.core.array_types import Key, PyTree
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import Architecture, HumanGSConfig
-from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.parts import (
     Decoder,
     Encoder,
     Encoding,
     HumanGSInputs,
     HumanGSOutputs,
+    Parameters,
     Pass,
     Reader,
     Target,
@@ -70,7 +70,7 @@ def apply_humangs(
     config: HumanGSConfig,
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
-) -> tuple[HumanGSOutputs, Variables]:
+) -> tuple[HumanGSOutputs, Parameters]:
     """The whole network for one subject: outputs and batch statistics.
 
     train: normalise by this subject's statistics and return updated running ones. Under a vmap over subjects give the
@@ -161,12 +161,7 @@ def decode(variables: Variables, features: PyTree, inputs: HumanGSInputs, config
 
 def part_variables(variables: Variables, part: str) -> Variables:
     """{"params": ..., "batch_stats": ...} of one part; what it does not have is absent."""
-    return {kind: tree[part] for kind, tree in variables.items() if part in tree}
-
-
-def needed_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[jax.Array, ""]:
-    """The token capacity that these photos need: patches that the foreground touches, over all views."""
-    return jnp.sum(touched_patches(inputs, config.architecture.encoder.patch_size), dtype=jnp.int32)
+    return {kind: cast(Parameters, tree[part]) for kind, tree in variables.items() if part in tree}
 
 
 def _example_inputs(parts: Architecture) -> HumanGSInputs:

@@ -16,8 +16,8 @@ Lengths inside the network are normalised units: metres divided by s = (height o
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -33,7 +33,11 @@ from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import Rendering
 
 T = TypeVar("T")
-Variables = dict[str, Any]
+if TYPE_CHECKING:
+    Parameters: TypeAlias = dict[str, "Array | Parameters"]
+    Variables: TypeAlias = dict[str, Parameters]
+else:
+    Parameters = Variables = Mapping
 TARGET_HEIGHT = 1.8
 """Height of every canonical body in normalised units."""
 

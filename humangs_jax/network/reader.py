@@ -67,7 +67,7 @@ class PixelAlignedReader(Reader):
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
         grid, unit, maps = run.conventions.pixel_grid, subject_unit(inputs.canonical_vertices), encoding.maps
         cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
-        pixels, visible = project_and_test(inputs, grid)
+        pixels, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, grid)
         pooled = visible if run.conventions.pool == "visible" else inputs.present[:, None]
         weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (cameras.width, cameras.height)
@@ -92,13 +92,17 @@ class PixelAlignedReader(Reader):
         return VertexFeatures(local, encoding.global_token, colors, fraction, shells=shells, normals=inputs.canonical_normals)
 
 
-def project_and_test(inputs: HumanGSInputs, grid: PixelGrid) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
+def project_and_test(
+    cameras: Camera,
+    vertices: Float[Array, "v n 3"],
+    depth_maps: Float[Array, "v h w"],
+    present: Bool[Array, " v"],
+    grid: PixelGrid,
+) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
     """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
-    unit = subject_unit(inputs.canonical_vertices)
-    cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
     see = lambda p, z, surface: visible_vertices(p, z, surface, (cameras.width, cameras.height), grid)
-    return pixels, jax.vmap(see)(pixels, depths, inputs.depth_maps) & inputs.present[:, None]
+    return pixels, jax.vmap(see)(pixels, depths, depth_maps) & present[:, None]
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.core.array_types import PyTree
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.io.arrays import check_checksum, checksum
@@ -34,7 +35,7 @@ def expected_variables(config: HumanGSConfig) -> Variables:
     return jax.eval_shape(lambda key: init_humangs(key, config), jax.random.key(0))
 
 
-def flatten_variables(variables: Variables) -> dict[str, Any]:
+def flatten_variables(variables: PyTree) -> dict[str, Any]:
     """{"params/encoder/...": leaf}."""
     leaves = jax.tree_util.tree_leaves_with_path(variables)
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
@@ -42,7 +43,7 @@ def flatten_variables(variables: Variables) -> dict[str, Any]:
 
 @checked_arguments
 def save_weights(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     variables: Variables,
     config: HumanGSConfig,
     dtype: Literal["float32", "float16"] = "float32",
@@ -75,7 +76,7 @@ def save_weights(
 
 
 @checked_arguments
-def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
+def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables, HumanGSConfig]:
     """Variables (float32) and configuration of a weights file, with default `Runtime`.
 
     Args:
@@ -103,7 +104,7 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
         return _load_weights(path)
 
 
-def _load_weights(path: str | os.PathLike) -> tuple[Variables, HumanGSConfig]:
+def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfig]:
     tensors, _, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"

@@ -317,7 +317,7 @@ def refiner_iteration(
     return cast(Any, Refiner().apply(variables, values, start, hidden, signals, graph, center))
 
 
-def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:
+def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
     """Write the variables of a `Refiner`; the file appears whole or not at all."""
     from safetensors.numpy import save
 
@@ -325,7 +325,7 @@ def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:
     write_bytes(path, save(tensors))
 
 
-def read_refiner(path: str | os.PathLike) -> PyTree:
+def read_refiner(path: str | os.PathLike[str]) -> PyTree:
     """What `save_refiner` wrote. Raises: FileNotFoundError; FileError if it is no safetensors file."""
     variables: dict[str, Any] = {}
     for key, tensor in read_safetensors(path)[0].items():

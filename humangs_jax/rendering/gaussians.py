@@ -57,9 +57,9 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
     return {f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names}
 
 
-def added_variance(gaussians: Gaussians, eps2d: float) -> float:
+def added_variance(low_pass: Float[Array, " g"] | None, eps2d: float) -> float:
     """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the scales contain a low-pass."""
-    return eps2d if gaussians.low_pass is None else min(eps2d, MIP_EPS2D)
+    return eps2d if low_pass is None else min(eps2d, MIP_EPS2D)
 
 
 def widened(scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1) -> Float[Array, "g 3"]:

@@ -36,10 +36,8 @@ from humangs_jax.rendering.gaussians import Gaussians, added_variance
 from humangs_jax.rendering.harmonics import added_colors
 from humangs_jax.rendering.splat_config import (
     DEFAULT_CONFIG,
-    EPS2D,
     LARGEST_FOOTPRINT,
     LEAST_DIMMING,
-    NEAR,
     SplatConfig,
 )
 
@@ -90,26 +88,19 @@ class ProjectedGaussians(NamedTuple):
         return 2 * jnp.stack([r00 * r00, r00 * r01, r01 * r01 + r11 * r11], axis=-1)
 
 
-def project(
-    gaussians: Gaussians,
-    camera: Camera,
-    near: float = NEAR,
-    eps2d: float = EPS2D,
-    jacobian_margin: float | None = None,
-    normalize_quats: bool = True,
-) -> ProjectedGaussians:
-    """Projects every Gaussian.
+def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
+    """Every Gaussian on the image that `config` draws: the first half of `splatting.render`.
 
-    Arguments: near: metres. eps2d: pixels^2, see `added_variance`. jacobian_margin: None for the exact Jacobian; a number
-    clamps the point where it is evaluated, to that fraction of the half field of view beyond the border
-    (INRIA: 0.3). normalize_quats: False uses quaternions without normalising them.
+    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
+    border.
     """
-    eps2d = added_variance(gaussians, eps2d)
+    gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
+    eps2d, jacobian_margin = added_variance(gaussians.low_pass, config.eps2d), config.jacobian_margin
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means = _planes(gaussians.means)
     X, Y, Z = (_dot(rotation[i], means) + translation[i] for i in range(3))
-    in_front = near < Z
+    in_front = config.near < Z
     X, Y = jnp.where(in_front, X, 0.0), jnp.where(in_front, Y, 0.0)
     inverse_depth = 1 / jnp.where(in_front, Z, 1.0)
     u, v = X * inverse_depth, Y * inverse_depth
@@ -123,7 +114,7 @@ def project(
         [zx * (rotation[0, j] - ju * rotation[2, j]) for j in range(3)],
         [zy * (rotation[1, j] - jv * rotation[2, j]) for j in range(3)],
     ]
-    m = _times_factors(jw, gaussians, normalize_quats)
+    m = _times_factors(jw, gaussians, config.normalize_quats)
 
     small = _all([jnp.abs(entry) < LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
@@ -158,12 +149,6 @@ def drawn_camera(camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> Camera
     if config.scale == 1:
         return camera
     return camera.resized(*(max(1, round(size * config.scale)) for size in (camera.width, camera.height)))
-
-
-def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
-    """`project` on the image that `config` draws: the first half of `splatting.render`."""
-    gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
-    return project(gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats)
 
 
 def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:

@@ -51,13 +51,13 @@ def render_reference(
         ...     exact = hg.render_reference(gaussians, camera).rgb
     """
     drawn = with_background(gaussians, camera, background)
-    return _reference(*drawn, splat_config(config), features_of(gaussians, features))
+    return _reference(*drawn, splat_config(config), features_of(features, len(gaussians.opacities)))
 
 
 @jax.jit
 def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None) -> Rendering:
     centers, axes, depths, visible = _project(gaussians, camera, config)
-    eps2d = added_variance(gaussians, config.eps2d)
+    eps2d = added_variance(gaussians.low_pass, config.eps2d)
     determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
     if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
         contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / depths) ** 2, 1)

@@ -124,7 +124,7 @@ def render(
             f"render draws one camera, got a batch {camera.batch_shape}: use render_views(gaussians, cameras), "
             "or jax.vmap(render, in_axes=(None, 0))(gaussians, cameras) to draw all views at once"
         )
-    return _render(_draw_image, gaussians, camera, config, background, features)
+    return _render(draw, gaussians, camera, config, background, features)
 
 
 @checked_arguments
@@ -190,7 +190,7 @@ def _render(
         raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
-    features = features_of(gaussians, features)
+    features = features_of(features, len(gaussians.opacities))
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background, features))):
         config = with_default_buffers(gaussians, cameras, config)
         rendering = draw(gaussians, cameras, background, config, features)
@@ -212,13 +212,6 @@ def _render(
 @functools.cache
 def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
     return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
-
-
-def _draw_image(
-    gaussians: Gaussians, camera: Camera, background: Array, config: SplatConfig, features: Array | None = None
-) -> Rendering:
-    gaussians, features = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), (gaussians, features))
-    return draw(gaussians, camera, background, config, features)
 
 
 @jax.custom_vjp
@@ -255,10 +248,10 @@ def with_background(gaussians: Gaussians, cameras: Camera, background: Backgroun
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
 
-def features_of(gaussians: Gaussians, features: Float[Array, "g n"] | None) -> Float[Array, "g n"] | None:
-    """In float32 at least. Raises: ValueError for those of other Gaussians."""
-    if features is not None and features.shape[:1] != gaussians.opacities.shape:
-        raise ValueError(f"features: expected shape ({len(gaussians.opacities)}, n), got {features.shape}")
+def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array, "g n"] | None:
+    """In float32 at least. Raises: ValueError for those of another number of Gaussians."""
+    if features is not None and features.shape[:1] != (count,):
+        raise ValueError(f"features: expected shape ({count}, n), got {features.shape}")
     return at_least_float32(features)
 
 
@@ -306,6 +299,7 @@ def draw(
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
     """`render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
+    gaussians, features = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), (gaussians, features))
     return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config, features)
 
 
@@ -317,7 +311,8 @@ def draw_views(
     features: Array | None = None,
 ) -> Rendering:
     """`draw` for every camera of a batch, one after the other."""
-    return lax.map(lambda camera: draw(gaussians, camera, background, config, features), cameras)
+    project = lambda camera: project_gaussians(gaussians, camera, config)
+    return lax.map(lambda camera: _draw(project(camera), gaussians, camera, background, config, features), cameras)
 
 
 def _draw(

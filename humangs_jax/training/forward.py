@@ -26,7 +26,7 @@ from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent, simi
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, part_variables
-from humangs_jax.network.parts import Drawn, HumanGSOutputs, Variables, stage
+from humangs_jax.network.parts import Drawn, HumanGSOutputs, Parameters, Variables, stage
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.splatting import draw_projected
@@ -44,7 +44,7 @@ def reconstruct_example(
     config: TrainConfig,
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
-) -> tuple[HumanGSOutputs, Variables]:
+) -> tuple[HumanGSOutputs, Parameters]:
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     model = token_share(config, len(inputs.images))
     prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model))

@@ -15,7 +15,6 @@ from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar,
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
-from humangs_jax.data.views import SubjectViews
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.losses.losses import loss_terms
 from humangs_jax.losses.metrics import psnr
@@ -33,6 +32,8 @@ COUNTS = ("dropped_tokens", "overflow")
 AUGMENTED = 1
 """Makes the key of a subject's augmentation from that of its backgrounds."""
 
+Seed = Shaped[Array, " n"] | Shaped[np.ndarray, " n"]
+"""`seed_numbers`."""
 Metrics = dict[str, Shaped[Array, ""]]
 Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
 """Loss, gradients, updated batch statistics, metrics."""
@@ -45,10 +46,11 @@ def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"
     return jnp.where(jax.random.bernoulli(choice_key, share, (count, 1)), colors, 1.0)
 
 
-def change_background(targets: SubjectViews, backgrounds: Float[Array, "v 3"]) -> Float[Array, "v h w 3"]:
-    """The target photos, which are on white, as they would look on other colors."""
-    uncovered = 1 - targets.masks[..., None]
-    return targets.images + uncovered * (backgrounds[:, None, None, :] - 1)
+def change_background(
+    images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], backgrounds: Float[Array, "v 3"]
+) -> Float[Array, "v h w 3"]:
+    """Photos on white as they would look on other colors."""
+    return images + (1 - masks[..., None]) * (backgrounds[:, None, None, :] - 1)
 
 
 @functools.cache
@@ -58,7 +60,7 @@ def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
         return np.asarray(jax.random.key_data(jax.random.key(seed)))
 
 
-def subject_keys(seed: Shaped[Array, " n"] | Shaped[np.ndarray, " n"], step: Int[Array, ""], count: int) -> Array:
+def subject_keys(seed: Seed, step: Int[Array, ""], count: int) -> Array:
     """One key per subject of a step. seed: `seed_numbers`."""
     return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(jnp.asarray(seed)), step), count)
 
@@ -82,7 +84,7 @@ def subject_loss(
     colored = config.loss.random_background if driver is None or driver.has_alpha else 0.0
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
-    images = change_background(targets, backgrounds)
+    images = change_background(targets.images, targets.masks, backgrounds)
     drawn = draw_targets(variables, outputs, body, example.inputs, targets, backgrounds, config)
     compare = lambda drawn: loss_terms(drawn, images, targets.masks, targets.depths, config.loss, networks)
     terms = stage("loss", compare, drawn, apart=True)
@@ -186,7 +188,9 @@ def train_step(
 
 
 @functools.cache
-def compiled_update() -> Callable[..., tuple[TrainState, Metrics]]:
+def compiled_update() -> Callable[
+    [TrainState, Example, BodyModel, LossNetworks, Seed, TrainConfig, Mesh | None], tuple[TrainState, Metrics]
+]:
     """`update` for the default backend; a step of all runs that differ in host settings alone is one program."""
     static, options = ("config", "mesh"), compiler_options()
     return jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
@@ -197,7 +201,7 @@ def update(
     batch: Example,
     body: BodyModel,
     networks: LossNetworks,
-    seed: Shaped[Array, " n"] | Shaped[np.ndarray, " n"],
+    seed: Seed,
     config: TrainConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:

@@ -100,7 +100,7 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
         "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
-        | {"eps2d": added_variance(avatar.gaussians, how.eps2d), "low_pass": _low_pass(avatar)},
+        | {"eps2d": added_variance(avatar.gaussians.low_pass, how.eps2d), "low_pass": _low_pass(avatar)},
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
@@ -256,7 +256,11 @@ def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar
 
 @checked_arguments
 def write_page(
-    path: str | os.PathLike, avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None
+    path: str | os.PathLike[str],
+    avatar: Avatar,
+    motion: Motion | None = None,
+    title: str = "avatar",
+    motion_name: str | None = None,
 ) -> int:
     """Write the page; it appears whole or not at all. Returns its size in bytes. Raises: as `page_html`; OSError."""
     text = page_html(avatar, motion, title, motion_name)
@@ -270,7 +274,7 @@ class NotebookPage:
     def __init__(self, text: str, height: int):
         self._text, self._height = text, height
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page as one file that any browser opens. Raises: OSError."""
         write_text(path, self._text)
 

@@ -32,7 +32,7 @@ from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.mesh import parse_glb, read_accessor
 from humangs_jax.rendering.gaussians import covariances, widened
-from humangs_jax.rendering.projection import project
+from humangs_jax.rendering.projection import project_gaussians as project
 
 MATRICES = {
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

@@ -13,7 +13,7 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.reading import FileError
 from humangs_jax.rendering.gaussians import Gaussians, widened
-from humangs_jax.rendering.projection import project
+from humangs_jax.rendering.projection import project_gaussians as project
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D, SplatConfig
 from humangs_jax.rendering.splatting import render

@@ -10,7 +10,7 @@ import pytest
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
-    _assemble_compiled,
+    _reconstruct,
     _views,
     make_avatar,
     reconstruct,
@@ -405,10 +405,10 @@ def test_masks_displace_the_body_if_the_network_looks_at_the_person_alone(body, 
 def test_programs_are_compiled_once_per_bucket(body, network):
     variables, config = network
     config = config.with_runtime(tokens="all")
-    before = _assemble_compiled._cache_size()
+    before = _reconstruct._cache_size()
     for views in (17, 18, 19):
         reconstruct(variables, config, capture_of(body, 0, views))
-    assert _assemble_compiled._cache_size() == before + 1
+    assert _reconstruct._cache_size() == before + 1
 
 
 def test_what_cannot_be_one_batch_is_named(body, network):
@@ -456,7 +456,7 @@ def test_views_and_bodies_of_another_configuration_are_refused(body, network):
 
 def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
     module = sys.modules[reconstruct_batch.__module__]
-    inputs = SimpleNamespace()
+    inputs = SimpleNamespace(posed_vertices=None)
     monkeypatch.setattr(module, "_prepare_batch", lambda *_: inputs)
     monkeypatch.setattr(module, "_check_posed", lambda *_: None)
     monkeypatch.setattr(module, "fit_buffers", lambda _, config: config)

@@ -10,8 +10,8 @@ from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
 from humangs_jax.core.pytree import replace
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, paper_parts
-from humangs_jax.network.encoder import PatchTransformer, pack_patches, touched_patches
-from humangs_jax.network.humangs import apply_humangs, encode, needed_tokens, read
+from humangs_jax.network.encoder import PatchTransformer, needed_tokens, pack_patches, touched_patches
+from humangs_jax.network.humangs import apply_humangs, encode, read
 from humangs_jax.network.parts import Encoding, subject_unit
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import Block, TransformerConfig
@@ -173,8 +173,8 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
     assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
-    assert run(variables, inputs, tight)[1].dropped_tokens == 2 and needed_tokens(inputs, tight) == 5
-    packing = pack_patches(touched_patches(inputs, 8), 3)
+    assert run(variables, inputs, tight)[1].dropped_tokens == 2 and needed_tokens(inputs.foreground, None, 8) == 5
+    packing = pack_patches(touched_patches(inputs.foreground, None, 8), 3)
     assert packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
 
 

@@ -10,7 +10,7 @@ from network_cases import TINY, random_inputs
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit, project
-from humangs_jax.network.parts import Encoding
+from humangs_jax.network.parts import Encoding, subject_unit
 from humangs_jax.network.reader import (
     UNSEEN_COLOR,
     PixelAlignedReader,
@@ -99,7 +99,9 @@ def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
     features = PixelAlignedReader(output_width=None, sample_rgb=True).apply(
         {}, Encoding(maps, None, jnp.int32(0)), inputs, TINY.with_conventions(pool=pool).run()
     )
-    pixels, visible = project_and_test(inputs, "half_pixel")
+    unit = subject_unit(inputs.canonical_vertices)
+    cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
+    pixels, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, "half_pixel")
     inner = visible[0] & jnp.all((pixels[:2] > 1) & (pixels[:2] < 31), axis=(0, 2))
     assert inner.sum() > 5 and not visible[1:].any()
     np.testing.assert_allclose(features.local[inner], 2.0 if pool == "visible" else 4.0, rtol=1e-5)

@@ -14,7 +14,7 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import stack_cameras
 from humangs_jax.rendering import harmonics, reference
 from humangs_jax.rendering.gaussians import constrain, skin_gaussians, unconstrain
-from humangs_jax.rendering.projection import project
+from humangs_jax.rendering.projection import project_gaussians as project
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splatting import SplatConfig, render
 

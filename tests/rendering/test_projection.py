@@ -10,12 +10,12 @@ from splat_scenes import camera, few, random_gaussians
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import camera as pinhole
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.rendering import projection
 from humangs_jax.rendering.gaussians import Gaussians, covariances
-from humangs_jax.rendering.splat_config import EPS2D, SPLAT_PRESETS
+from humangs_jax.rendering.projection import project_gaussians
+from humangs_jax.rendering.splat_config import EPS2D, SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.tiling import squared_reach
 
-project = jax.jit(projection.project, static_argnames=("near", "eps2d", "jacobian_margin"))
+project = jax.jit(project_gaussians)
 
 FLOAT64 = 1e-9
 """float64 rounding, grown by 1/z^2 near the camera."""
@@ -114,7 +114,7 @@ def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
     view = replace(view, K=view.K.at[0, 2].set(view.width / 2), cam_from_world=jnp.eye(4))
     beside = replace(ball, means=jnp.asarray([[2.0, 0.1, 0.2]]))
     margin = SPLAT_PRESETS["inria"].jacobian_margin
-    free, clamped = (project(beside, view, jacobian_margin=m) for m in (None, margin))
+    free, clamped = (project(beside, view, SplatConfig(jacobian_margin=m)) for m in (None, margin))
     focal = view.K[0, 0]
     at = 1.3 * 0.5 * view.width / focal
     np.testing.assert_allclose(clamped.xx[0], (0.01 * focal / 0.2) ** 2 * (1 + at**2) + EPS2D, rtol=FLOAT64)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians
 
 from humangs_jax.rendering import tiling
-from humangs_jax.rendering.projection import project
+from humangs_jax.rendering.projection import project_gaussians as project
 from humangs_jax.rendering.tiling import TileGrid
 
 FEW = settings(max_examples=10, deadline=None)

@@ -17,8 +17,6 @@ from humangs_jax.avatar.reconstruct import reconstruct_views
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import CaptureCache, Loader, ViewSampling
-from humangs_jax.data.views import SubjectViews
-from humangs_jax.geometry.camera import Camera
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Drawn
@@ -196,18 +194,12 @@ def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype)
     assert float(metrics["perceptual"]) < first
 
 
-def views_on_white(color, masks):
-    images = masks[..., None] * color + (1 - masks[..., None])
-    cameras = jax.vmap(lambda K: Camera(K, jnp.eye(4), 4, 4))(jnp.broadcast_to(jnp.eye(3), (2, 3, 3)))
-    return SubjectViews(images, masks, cameras, jnp.zeros((2, 1, 3)), jnp.zeros((2, 3)), jnp.zeros(1))
-
-
 def test_backgrounds_are_exchanged_like_those_of_photos():
     masks = jnp.asarray(np.random.default_rng(0).random((2, 4, 4)), jnp.float32)
     color, backgrounds = jnp.asarray([0.2, 0.5, 0.9]), jnp.asarray([[0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
-    views = views_on_white(color, masks)
+    images = masks[..., None] * color + (1 - masks[..., None])
     expected = masks[..., None] * color + (1 - masks[..., None]) * backgrounds[:, None, None]
-    np.testing.assert_allclose(change_background(views, backgrounds), expected, atol=FLOAT32)
+    np.testing.assert_allclose(change_background(images, masks, backgrounds), expected, atol=FLOAT32)
 
 
 def test_the_share_of_random_backgrounds_is_kept():

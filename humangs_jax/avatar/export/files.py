@@ -32,7 +32,7 @@ def frame_range(text: str, count: int) -> range:
 
 
 def export(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     avatar: Avatar,
     motion: Motion | None = None,
     numbers: Sequence[int] | None = None,

@@ -134,7 +134,7 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 
 @checked_arguments
-def load_gaussians(path: str | os.PathLike, *, y_up: bool = False) -> Gaussians:
+def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gaussians:
     """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas), `.splat`, `.spz`, `.glb`.
 
     Args:
@@ -165,7 +165,7 @@ def load_gaussians(path: str | os.PathLike, *, y_up: bool = False) -> Gaussians:
 
 
 @checked_arguments
-def save_gaussians(path: str | os.PathLike, gaussians: Gaussians, *, y_up: bool = False) -> None:
+def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: bool = False) -> None:
     """Write Gaussians into a file for other programs; it appears whole or not at all.
 
     Deformations become quaternions and scales. A low-pass is taken out of the scales.

@@ -24,7 +24,7 @@ EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
 COEFFICIENTS = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
 
 
-def write_glb(path: str | os.PathLike, gaussians: Gaussians) -> None:
+def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
 
     Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the extension's coefficients.

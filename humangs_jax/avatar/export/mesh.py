@@ -156,7 +156,7 @@ def write_animation(path: Path, files: Sequence[Path], avatar: Avatar, motion: M
 
 
 def write_mesh_glb(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     avatar: Avatar,
     mesh: BodyMesh,
     motion: Motion | None = None,

@@ -49,7 +49,7 @@ Columns = Mapping[str, np.ndarray]
 
 
 @checked_arguments
-def write_ply(path: str | os.PathLike, gaussians: Gaussians, rest_fields: bool = False) -> None:
+def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: bool = False) -> None:
     """Write a 3DGS `.ply`; the file appears whole or not at all.
 
     rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there are no such harmonics.

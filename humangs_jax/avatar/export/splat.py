@@ -15,7 +15,7 @@ ROW = [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotatio
 ROW_BYTES = 32
 
 
-def write_splat(path: str | os.PathLike, gaussians: Gaussians) -> None:
+def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits, quaternions to 7.
 
     Raises: ValueError for Gaussians with harmonics.

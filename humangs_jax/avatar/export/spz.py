@@ -32,7 +32,7 @@ COLOR_SCALE, SCALE_STEPS, SCALE_ZERO, HARMONIC_STEPS = 0.15, 16.0, 10.0, 128.0
 QUATERNION_STEPS = 511
 
 
-def write_spz(path: str | os.PathLike, gaussians: Gaussians) -> None:
+def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.spz`; the file appears whole or not at all.
 
     Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to 10. Harmonics are from -1 to 1.
