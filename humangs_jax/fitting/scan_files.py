@@ -253,7 +253,7 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     return found
 
 
-def read_placement(file):
+def read_placement(file: Path) -> Similarity:
     """The similarity from a scan to the world of its images. Raises: FileError unless it is one."""
     with reading(file, "file of render_scan_views"):
         content = read_json(file)

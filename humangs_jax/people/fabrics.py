@@ -193,18 +193,18 @@ def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1 << 20))
 
 
-def plain(s, rng, base, _other):
+def plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """One dye, slightly uneven."""
     return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
-def stripes(s, rng, base, other, upright=False):
+def stripes(s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False) -> Points:
     """Stripes around (or, upright, along) the limb."""
     period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
     return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
 
 
-def checks(s, rng, base, other):
+def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Gingham, or tartan with thin lines of a third dye."""
     period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
     result = mix(base, other, 0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)))
@@ -212,7 +212,7 @@ def checks(s, rng, base, other):
     return mix(result, third, 0.7 * lines) if tartan else result
 
 
-def dots(s, rng, base, other):
+def dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Polka dots in a triangular grid."""
     period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
     row = np.floor(s.along / period)
@@ -221,7 +221,7 @@ def dots(s, rng, base, other):
     return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
 
 
-def flowers(s, rng, base, other):
+def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Scattered blossoms of five petals in two dyes."""
     period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
     plane = np.stack([s.around, s.along], -1) / period
@@ -234,7 +234,7 @@ def flowers(s, rng, base, other):
     return mix(mix(base, dye, petals), np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
 
 
-def mottled(s, rng, base, other):
+def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Camouflage, batik, tie-dye: thresholded or soft noise."""
     scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
     width, third = 0.02 if rng.random() < 0.5 else 0.2, accent(rng, other)
@@ -245,13 +245,13 @@ def mottled(s, rng, base, other):
     return mix(mix(base, other, first), third, 0.8 * second)
 
 
-def melange(s, rng, base, other):
+def melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Knit: fine grain."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
 
-def denim(s, rng, base, _other):
+def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """Faded on the front of the thighs and at creases, grained along the thread."""
     cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
@@ -276,7 +276,7 @@ CAMOUFLAGES = np.asarray([
 """Four colors each: earth, sand, town, sea."""
 
 
-def camouflage(s, rng, _base, _other):
+def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
     """Torn blots of four colors, larger ones below smaller ones."""
     dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
@@ -289,14 +289,14 @@ def camouflage(s, rng, _base, _other):
     return result
 
 
-def herringbone(s, rng, base, other):
+def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Zigzags of slanted threads."""
     period, pitch, share = rng.choice([0.03, 0.045]), rng.choice([0.008, 0.012]), rng.uniform(0.35, 0.7)
     side = np.abs((s.around / period) % 2 - 1) * period
     return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
 
 
-def argyle(s, rng, base, other):
+def argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Diamonds with thin lines across."""
     period, third = rng.choice([0.06, 0.09]), accent(rng, other)
     x, y = s.around / period, s.along / (1.6 * period)
@@ -306,7 +306,7 @@ def argyle(s, rng, base, other):
     return mix(mix(base, other, diamond), third, 0.8 * lines)
 
 
-def dip_dye(s, rng, base, other):
+def dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
     rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
     wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
@@ -317,13 +317,13 @@ def dip_dye(s, rng, base, other):
     return mix(mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)), third, band(twist, 0.4, 0.6, 0.15))
 
 
-def tweed(s, rng, base, other):
+def tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Woven in two threads of nearly one color."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2)
 
 
-def cable_knit(s, rng, base, _other):
+def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """Plaits of thick yarn: light and dark, no second dye."""
     period = rng.choice([0.05, 0.07])
     x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
@@ -333,7 +333,7 @@ def cable_knit(s, rng, base, _other):
     return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
 
 
-def color_blocks(s, rng, base, other):
+def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """A chest (or thigh) in another dye, with a line between."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
     return mix(mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level))

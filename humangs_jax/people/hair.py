@@ -115,8 +115,8 @@ def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: fl
     elif kind not in ("buzz", "bald"):
         bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
         quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
-        look = {"size": size, "quiff": quiff, "side": haircut.side * parted, "shift": haircut.receding}
-        parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, **look))
+        side, shift = haircut.side * parted, haircut.receding
+        parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, size, shift=shift, quiff=quiff, side=side))
     if kind in TAILS:
         length, knots = TAILS[kind]
         parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
@@ -158,7 +158,16 @@ def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
 
 
 def scalp_shell(
-    rng, anatomy: Anatomy, thickness: float, bumps: float, size=0.05, hat=False, shift=0.0, crown=0.0, quiff=0.0, side=0
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    thickness: float,
+    bumps: float,
+    size: float = 0.05,
+    hat: bool = False,
+    shift: float = 0.0,
+    crown: float = 0.0,
+    quiff: float = 0.0,
+    side: float | int = 0,
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
@@ -188,7 +197,14 @@ def scalp_shell(
 
 
 def falling_tube(
-    rng, anatomy: Anatomy, thickness: float, bottom: float, opening: Opening, wave=0.004, ends=None, over=0.0
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    thickness: float,
+    bottom: float,
+    opening: Opening,
+    wave: float = 0.004,
+    ends: float | None = None,
+    over: float = 0.0,
 ) -> Surface:
     """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the height `bottom` at the back.
 
@@ -244,7 +260,7 @@ def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
 
 
-def tail(rng, anatomy: Anatomy, length: float, knots: float) -> Surface:
+def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
     """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres apart."""
     start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
     rows, columns = 40 if knots else 16, 14
@@ -274,7 +290,7 @@ def beard_field(template: Points, kind: str) -> Field:
     return np.where((y > 0.19) & (x < 0.08) & (z > 0.0), field, -1.0)
 
 
-def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
+def beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     """A beard that thins out towards the cheeks."""
     template = anatomy.skin.template
     field = beard_field(template, kind)

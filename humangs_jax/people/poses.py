@@ -219,7 +219,14 @@ def draw_goal(rng: np.random.Generator) -> str:
     return choice(rng, {name: goal.odds for name, goal in GOALS.items()})
 
 
-def bend_arm(rng, build: kin.Build, rotations: kin.Rotations, goal: str, side: int, other_arm: bool = False) -> float:
+def bend_arm(
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: kin.Rotations,
+    goal: str,
+    side: int,
+    other_arm: bool = False,
+) -> float:
     """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
 
     other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).

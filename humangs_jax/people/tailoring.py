@@ -267,7 +267,15 @@ def _push(
 
 
 def skirt(
-    rng, anatomy: Anatomy, heights: tuple, ease: float, flare: float, pleats: tuple, gap=-1.0, spread=0.0, cling=0.0
+    rng: np.random.Generator,
+    anatomy: Anatomy,
+    heights: tuple[float, float],
+    ease: float,
+    flare: float,
+    pleats: tuple[float | int, float],
+    gap: float = -1.0,
+    spread: float = 0.0,
+    cling: float = 0.0,
 ) -> Surface:
     """A tube around the hips and both legs between two template heights (top, bottom), `ease` metres wider than they are.
 

@@ -264,7 +264,7 @@ class Footprints(NamedTuple):
     determinant: Float[Array, " g"]
     reach: Float[Array, " g"]
 
-    def rows(self, grid: TileGrid):
+    def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First row of tiles of each splat, and how many."""
         half = jnp.sqrt(self.reach * self.yy)
         row0 = _first(self.y - half, grid.tile_size, grid.rows)
@@ -313,7 +313,7 @@ class Squares(NamedTuple):
     y: Float[Array, " g"]
     radius: Float[Array, " g"]
 
-    def rows(self, grid: TileGrid):
+    def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First row of tiles of each splat, and how many."""
         first, last = self._range(self.y, grid.tile_size, grid.rows)
         return first, jnp.where(self.radius > 0, jnp.maximum(last - first + 1, 0), 0)
@@ -321,7 +321,7 @@ class Squares(NamedTuple):
     def bands(self) -> "Squares":
         return self
 
-    def columns(self, row, grid: TileGrid):
+    def columns(self, row: Int[Array, " g"], grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
         """First and last tile of each square, the same in all its rows."""
         return self._range(self.x, grid.tile_size, grid.columns)
 

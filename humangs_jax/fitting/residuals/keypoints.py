@@ -18,6 +18,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.transform import EXACT
 
+AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
 NOISE, LEAST_NOISE = 0.005, 0.3
@@ -52,14 +53,12 @@ class Observations(Batchable):
     world: Float[Array, "c k 3"] | None = None
 
 
-def make_observations(points, confidences, K, cam_from_world, world=None) -> Observations:
+def make_observations(
+    points: AnyArray, confidences: AnyArray, K: AnyArray, cam_from_world: AnyArray, world: AnyArray | None = None
+) -> Observations:
     """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
-    given = (
-        (points, confidences, K, cam_from_world, noise)
-        if world is None
-        else (points, confidences, K, cam_from_world, noise, world)
-    )
+    given = (points, confidences, K, cam_from_world, noise, *(() if world is None else (world,)))
     return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
 
 
