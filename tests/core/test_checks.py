@@ -59,7 +59,7 @@ WRONG = {
     "buffers": (lambda: hg.plan_buffers(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
     "order of reconstruct": (
         lambda: hg.reconstruct(CAPTURE, {}, CONFIG),
-        r"reconstruct\(variables, config, capture\): config: expected HumanGSConfig, got dict",
+        r"reconstruct\(variables, config, capture\): variables: expected Mapping, got Capture",
     ),
     "a batch for reconstruct": (lambda: hg.reconstruct({}, CONFIG, [CAPTURE]), "capture: expected Capture, got list"),
     "one for a batch": (
