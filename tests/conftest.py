@@ -106,12 +106,27 @@ def body():
 
 
 @pytest.fixture(scope="session")
-def capture_folder(tmp_path_factory):
+def demo():
+    """The shipped capture."""
+    from humangs_jax.data.capture import load_capture
+
+    return load_capture("demo_capture")
+
+
+@pytest.fixture
+def float64():
+    """JAX computes in 64 bits."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def capture_folder(demo, tmp_path_factory):
     """A copy of the shipped capture: with its four photos, so that the demo's programs are compiled once for both."""
-    from humangs_jax.data.capture import load_capture, save_capture
+    from humangs_jax.data.capture import save_capture
 
     path = tmp_path_factory.mktemp("captures") / "someone"
-    save_capture(path, load_capture("demo_capture"))
+    save_capture(path, demo)
     return path
 
 

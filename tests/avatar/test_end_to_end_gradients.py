@@ -112,10 +112,7 @@ SLOW = [
 SLOW += [Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")]
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def as_dtype(tree, dtype):

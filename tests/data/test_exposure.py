@@ -6,7 +6,6 @@ import itertools
 import numpy as np
 import pytest
 
-from humangs_jax.data.capture import load_capture
 from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, exposures, gains_of, multiplied, with_gains
 
 SHRINKING = 0.1
@@ -64,11 +63,6 @@ def test_outliers_do_not_count():
     colors[1, : POINTS // 5] *= 0.4  # a shadow
     found = np.log(gains_of(colors * np.exp(-logs)[:, None], np.ones((4, POINTS), bool)))
     np.testing.assert_allclose(found, logs, atol=2 * SHRINKING * 0.2)
-
-
-@pytest.fixture(scope="module")
-def demo():
-    return load_capture("demo_capture")
 
 
 def test_a_synthetic_capture_stays_as_it_is(demo):

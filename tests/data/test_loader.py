@@ -328,19 +328,12 @@ def test_a_folder_without_captures_is_named(tmp_path):
 # The release's rule ---------------------------------------------------------------------------------------------------
 
 
-def views_around(count):
-    """A subject of `count` views without images."""
-    azimuths = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    frames = np.zeros(count, int)
-    return StoredSubject(*[np.zeros(0)] * 4, frames, azimuths, *[np.zeros(0)] * 3)
-
-
 WINDOW = ViewSampling(input_counts=(4,), target_count=4, rule="window")
 
 
 def test_the_window_rule_is_the_release_s():
     """Of 60 views: the ends of a window come first, 25 to 59 views apart, then views inside of it; all are different."""
-    distances, subject = set(), views_around(60)
+    distances, subject = set(), fake_subject(60, 1)
     for seed in range(3000):
         inputs, targets = draw_views(np.random.default_rng(seed), subject, 4, WINDOW)
         first, last, *inside = inputs + targets
@@ -353,11 +346,11 @@ def test_the_window_rule_is_the_release_s():
 @pytest.mark.parametrize("count", [8, 9, 12, 24, 120])
 def test_the_window_rule_scales_with_the_number_of_views(count):
     for seed in range(200):
-        inputs, targets = draw_views(np.random.default_rng(seed), views_around(count), 4, WINDOW)
+        inputs, targets = draw_views(np.random.default_rng(seed), fake_subject(count, 1), 4, WINDOW)
         assert len({*inputs, *targets}) == 8 and min(inputs) >= 0 and max(inputs) < count
         assert max(7, round(25 * count / 60)) <= inputs[1] - inputs[0] <= max(7, round(59 * count / 60))
     with pytest.raises(ValueError, match="7 views, but inputs and targets need 8"):
-        draw_views(np.random.default_rng(0), views_around(7), 4, WINDOW)
+        draw_views(np.random.default_rng(0), fake_subject(7, 1), 4, WINDOW)
 
 
 def test_the_window_rule_is_a_function_of_seed_and_step(folder):

@@ -9,16 +9,10 @@ import pytest
 
 from humangs_jax.apps.settings import Settings
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.usable_views import _sampling, shares_on_masks, usable_indices, usable_views
 from humangs_jax.data.views import select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
-
-
-@pytest.fixture(scope="module")
-def demo():
-    return load_capture("demo_capture")
 
 
 def with_mask(capture, view, mask):

@@ -13,8 +13,6 @@ from hypothesis.extra.numpy import arrays
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import views as module
-from humangs_jax.data.capture import load_capture
-from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import greedy_cover, select_views, standardize
 
 GUARANTEE = 1 - 1 / np.e
@@ -54,11 +52,6 @@ def test_few_photos_are_all_taken_and_none_is_refused(demo):
     assert select_views(demo.select(range(3)), 5) == [0, 1, 2]
     with pytest.raises(ValueError, match="at least 1 photo, got 0"):
         select_views(demo, 0)
-
-
-@pytest.fixture(scope="module")
-def demo():
-    return load_capture(DEMO_CAPTURE)
 
 
 def test_without_a_number_what_adds_nothing_is_left_out(demo):

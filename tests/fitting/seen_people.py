@@ -5,9 +5,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from fit_people import default_body as body
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
-from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -16,11 +16,6 @@ from humangs_jax.fitting.state import pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 SIZE, NOISE = 256, 1.0
-
-
-@functools.cache
-def body():
-    return load_body()
 
 
 @functools.cache

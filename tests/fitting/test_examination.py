@@ -256,9 +256,6 @@ def test_the_people_of_these_tests_are_seen(good):
     assert isinstance(capture.cameras, Camera) and inside.mean() > 0.98
 
 
-#  ---------------------------------------------------------------------------------------------------------------------
-
-
 SIDE = 128
 WRIST_OF_SHEET, RIGHT_WRIST = (COCO_17.names.index(f"{side}_wrist") for side in ("left", "right"))
 

@@ -107,9 +107,6 @@ def test_pairs_of_views_are_compared_a_few_at_a_time_with_the_same_result(monkey
     np.testing.assert_allclose(found[4][0][:, KNOWN], found[66][0][:, KNOWN], atol=EXACT)
 
 
-#  ---------------------------------------------------------------------------------------------------------------------
-
-
 def random_similarity(seed):
     rng = np.random.default_rng(seed)
     scale = float(10 ** rng.uniform(-2, 2))

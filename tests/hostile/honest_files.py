@@ -372,12 +372,6 @@ def data_set(write, *arguments, **options):
     return seed
 
 
-def write_dna(folder):
-    import h5py
-
-    return dataset_files.write_dna(folder, h5py, frames=1)
-
-
 STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
 MODEL = dataset_files.model_arrays()
 MANIFEST = {"generator_version": GENERATOR_VERSION} | {

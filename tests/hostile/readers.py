@@ -168,7 +168,7 @@ colored_mesh = functools.partial(read_mesh, colors=True)
 avatarrex = data_set(dataset_files.write_avatarrex, frames=2)
 scenes = data_set(dataset_files.write_scenes, honest.MODEL, views=2)
 scans = data_set(dataset_files.write_thuman, honest.MODEL, kinds="C")
-dna = honest.write_dna if importlib.util.find_spec("h5py") else None
+dna = data_set(dataset_files.write_dna, frames=1) if importlib.util.find_spec("h5py") else None
 AIST = {"smpl_poses": np.zeros((3, 72)), "smpl_trans": np.zeros((3, 3)), "smpl_scaling": np.ones(1)}
 AMASS = zeros(poses=(3, 156), trans=(3, 3)) | {"mocap_framerate": 120.0}
 PARTS = zeros(global_orient=(3, 3), body_pose=(3, 63), transl=(3, 3))

@@ -19,10 +19,7 @@ LENGTHS = [4, 0, 5, 1, 0, 2]
 CONFIG = SplatConfig(tile_size=4, block=2, chunk=2, chunk_backward=3)
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def make(seed):

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from rounding import bound
 from splat_scenes import camera, few, random_gaussians
 
@@ -21,12 +20,6 @@ FLOAT64 = 1e-9
 """float64 rounding, grown by 1/z^2 near the camera."""
 
 FLOAT32 = 1e-5
-
-
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def test_covariance_is_that_of_the_linearised_camera(float64):

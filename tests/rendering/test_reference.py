@@ -17,10 +17,7 @@ EXACT = 1e-12
 FOCAL, SIZE = 10.0, 9
 
 
-@pytest.fixture(autouse=True)
-def _float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def axis_camera():

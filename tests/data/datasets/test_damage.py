@@ -11,7 +11,6 @@ import time
 import tracemalloc
 
 import dataset_files as files
-import h5_or_skip
 import numpy as np
 import pytest
 from changes import edit_pickle
@@ -77,7 +76,7 @@ WRITE = {
     "thuman4": files.write_thuman4,
     "actorshq": files.write_actorshq,
     "scenes": lambda folder: files.write_scenes(folder, files.model_arrays())[0].parent,
-    "dna": lambda folder: files.write_dna(folder, h5_or_skip.h5py()),
+    "dna": lambda folder: files.h5py() and files.write_dna(folder),
 }
 CASES = []
 
@@ -296,7 +295,7 @@ MAIN, NOTES = "main/0001_01.smc", "annotations/0001_01_annots.smc"
 
 def h5(path, change):
     def damage(folder):
-        with h5_or_skip.h5py().File(folder / path, "a") as file:
+        with files.h5py().File(folder / path, "a") as file:
             change(file)
 
     return damage
@@ -313,7 +312,7 @@ def h5_set(key, change, path=NOTES):
 
 def h5_link(file):
     del file[TRANSL]
-    file[TRANSL] = h5_or_skip.h5py().ExternalLink("elsewhere.h5", "/x")
+    file[TRANSL] = files.h5py().ExternalLink("elsewhere.h5", "/x")
 
 
 for path in (MAIN, NOTES):

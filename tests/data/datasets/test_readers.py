@@ -3,7 +3,6 @@
 import dataclasses
 import time
 
-import h5_or_skip
 import numpy as np
 import pytest
 from dataset_files import (
@@ -12,6 +11,7 @@ from dataset_files import (
     HEIGHT,
     WIDTH,
     cameras,
+    h5py,
     model_arrays,
     parameter_arrays,
     write_actorshq,
@@ -109,8 +109,8 @@ def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body
 
 
 def test_hdf5_is_read_as_it_was_written(tmp_path, body):
-    h5py = h5_or_skip.h5py()
-    (person,) = open_people(write_dna(tmp_path / "dna", h5py), body, SIZE)
+    h5py()
+    (person,) = open_people(write_dna(tmp_path / "dna"), body, SIZE)
     subject, values = person.subject, parameter_arrays()
     assert len(subject) == FRAMES * CAMERAS and not subject.missing
     np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], cameras()[0][1][1], atol=FLOAT32)
