@@ -18,7 +18,7 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 
-PIXELS, DRIVEN = ("lvsm", "humanram"), ("giga", "animatable", "lca")
+PIXELS, DRIVEN = ("lvsm", "lvsm_latents", "humanram"), ("giga", "animatable", "lca")
 SIZE, TEXELS = 32, 8
 BLOCKS = TransformerConfig(width=16, layers=4, head_width=8, class_token=False, mlp_ratio=1)
 PATCH = 8
@@ -30,9 +30,9 @@ def small(name: str) -> HumanGSConfig:
     parts = config.architecture
     change = dataclasses.replace
     if name in PIXELS:
-        texture = None if name == "lvsm" else TriplaneConfig(resolution=8, channels=2)
-        fusion = None if name == "lvsm" else 8
-        config = config.with_parts(driver=change(parts.driver, transformer=BLOCKS, texture=texture, fusion=fusion))
+        sizes = {"texture": TriplaneConfig(resolution=8, channels=2), "fusion": 8} if name == "humanram" else {}
+        sizes |= {"latents": 6} if name == "lvsm_latents" else {}
+        config = config.with_parts(driver=change(parts.driver, transformer=BLOCKS, **sizes))
     elif name == "lca":
         config = small_system("lhm_views").with_parts(driver=change(parts.driver, hidden=8, layers=1, joints=2))
     else:

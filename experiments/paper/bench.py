@@ -1,265 +1,313 @@
-"""What the experiments of the paper share: the variants that are trained, how one is trained and scored, printed numbers.
+"""What the experiments of the paper share: the variants that are trained, how a run goes and is scored, printed numbers.
 
-Every variant is a `TrainConfig` that differs from another one in what its name says. All see the same people, views and targets
-in the same order, have the same losses and number of steps, and are compared on the same views of the same unseen people.
+The reference is the paper's own network, narrower and with fewer layers. Every variant differs from it in what its name says,
+sees the same people, views and targets in the same order, has the same losses and learning rate, and is compared on the same
+views of the same unseen people.
+
+A run goes in rounds of `ROUND` steps with the squared error and the tightness of the paper, each with a learning rate that ends
+at 0, until it is `MARGIN` above the vertex-color baseline in the foreground of the validation people; or above it, and a round
+has gained less than `FLAT`; or `MOST_ROUNDS` are done, and it is not trained. Then comes a quarter of a round with the perceptual
+loss, too. So all that learn fast have the same number of steps. People are plain (`people.py`): on richer ones the systems that
+attend to photos show grey bodies after as many steps.
 """
 
 import dataclasses
+import functools
 import json
-import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import jax
-from scipy.stats import t
+import numpy as np
+from scipy.stats import t as student
 
+from experiments.costs import costs_of
+from experiments.paper.people import on_disk
 from experiments.results import REPOSITORY, write_json
+from experiments.systems import BENCH_WIDTH, SYSTEMS
 from experiments.systems import ONE_PHOTO as TAKE_ONE
-from experiments.systems import SYSTEMS
 from experiments.systems.grouped import GroupReader
 from experiments.systems.pixel_queries import QueryDriver
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.evaluation.cases import Predicted, draw_views
+from humangs_jax.evaluation.cases import (
+    Method,
+    Predicted,
+    draw_painted_body,
+    draw_views,
+    painted_body,
+)
 from humangs_jax.evaluation.run import evaluate
-from humangs_jax.evaluation.tables import mean_scores
-from humangs_jax.losses.loss_networks import load_loss_networks
-from humangs_jax.network.config import paper_parts
+from humangs_jax.evaluation.scores import EvaluationProtocol
+from humangs_jax.evaluation.tables import person_means
+from humangs_jax.losses.loss_networks import LossNetworks, load_loss_networks
+from humangs_jax.losses.losses import LossConfig
+from humangs_jax.network.config import HumanGSConfig, paper_parts
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.training.config import LossConfig, OptimizerConfig, TrainConfig
-from humangs_jax.training.forward import validate, validation_examples
+from humangs_jax.training.config import OptimizerConfig, TrainConfig, compiled_for
 from humangs_jax.training.loop import TrainingInterrupted, train
-from humangs_jax.training.sources import cached_people
+from humangs_jax.training.sources import stage_loader
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import seed_numbers, update
 
 PAGE = REPOSITORY / "docs" / "paper.md"
-SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}
-PHOTOS, TARGETS = 4, 6
-"""Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
+SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 3), "lpips_alex": ("LPIPS (Alex)", 3)}
+TASKS = {"reconstruction": "pose of the photos", "animation": "another pose"}
+PHOTOS = 4
+"""That a network is trained with, unless it takes one."""
 VIEW_COUNTS = (1, 2, 4, 6, 8)
+COUNTS = ("1", "2", "4", "6")
+NEAR = tuple(f"near {count}" for count in COUNTS)
+REFERENCE = "paper"
+"""The variant that all others are compared with."""
+ROUND, BATCH, MOST_ROUNDS = 300, 8, 12
+FLAT, MARGIN = 0.2, 2.0
+"""dB of foreground PSNR."""
+SEEDS = 3
+"""Of the reference, and of whom claims are about."""
+PROTOCOL = EvaluationProtocol(lpips=("alex",))
 PER_PERSON = ("animatable",)
 """Systems that are fitted to one person, and so have no place in a training on many."""
-ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pooling", "all tokens", "canonical")
-"""Marks of names that are no system of tables 1 to 3."""
-ONE_PHOTO = ", 1 photo"
-"""End of the names of variants that were trained with one."""
-NOISE = "noise"
-"""The claim of variants that differ from another one in the seed alone."""
-
-SHIPPED = "HumanGS, shipped"
-"""Name of the weights that come with the package."""
-PAINTED, PAINTED_TABLE = "vertex-color baseline", "paper_painted"
-"""The baseline without a network, and its table (`painted.py`)."""
-MARGIN = 3.0
-"""dB of foreground PSNR over the vertex-color baseline. With less all systems showed grey bodies, with more clothes."""
+PAINTED = "vertex-color baseline"
+"""The baseline without a network."""
 NOT_TRAINED = "not trained"
-PAPER = "paper"
-"""Marks a row of the printed paper in every table."""
-HUMANRAM, LVSM, GHG, OURS = "HumanRAM", "LVSM", "GHG", "HumanGS"
-ANIMATION = {
-    "LHM (single view)": (23.72, 0.95, 0.045, 4.59, 0.053),
-    HUMANRAM: (24.58, 0.96, 0.042, None, 0.287),
-    "Animatable Gaussians": (25.51, 0.96, 0.041, 12000, 0.245),
-    OURS: (25.24, 0.96, 0.04, 0.29, 0.048),
-}
-"""Table 1, AvatarReX: PSNR, SSIM, LPIPS, seconds to model, seconds a frame."""
-RECONSTRUCTION = {
-    HUMANRAM: ((28.98, 0.97, 0.021), (25.10, 0.96, 0.029)),
-    LVSM: ((24.38, 0.96, 0.036), None),
-    GHG: ((22.49, 0.95, 0.043), None),
-    OURS: ((27.99, 0.97, 0.025), (25.53, 0.96, 0.029)),
-}
-"""Table 2, THuman4.0: reconstruction, and reconstruction + animation."""
-DOMAINS = {
-    HUMANRAM: ((33.16, 0.98, 0.018), (27.76, 0.97, 0.029)),
-    LVSM: ((27.13, 0.95, 0.051), (20.86, 0.94, 0.056)),
-    GHG: ((26.91, 0.96, 0.039), (22.69, 0.93, 0.088)),
-    "GHG, released weights": ((22.80, 0.91, 0.067), None),
-    "GST, released weights": ((21.58, 0.92, 0.091), None),
-    OURS: ((30.81, 0.98, 0.024), (27.27, 0.97, 0.033)),
-    "GIGA, on its split": ((20.19, 0.794, 0.070), None),
-    "HumanGS, on GIGA's split": ((26.00, 0.945, 0.061), None),
-}
-"""Table 3, reconstruction: in the domain of training (THuman2.1), and in another one (AvatarReX)."""
-VIEWS = {
-    HUMANRAM: ((25.44, 0.946, 0.052), (27.39, 0.950, 0.044), (29.10, 0.960, 0.039), (29.90, 0.966, 0.036)),
-    LVSM: ((17.78, 0.900, 0.101), (22.64, 0.930, 0.066), (25.96, 0.950, 0.055), (27.03, 0.950, 0.051)),
-    GHG: ((21.71, 0.920, 0.094), (22.43, 0.930, 0.089), (22.69, 0.930, 0.088), (22.72, 0.930, 0.088)),
-    OURS: ((24.07, 0.936, 0.068), (25.71, 0.946, 0.059), (27.19, 0.950, 0.054), (27.84, 0.950, 0.051)),
-}
-"""THuman2.1 near, with 1, 2, 4 and 6 photos."""
-GAUSSIANS = {
-    "THuman2.1": ((30.66, 0.970, 0.028), (30.81, 0.980, 0.024)),
-    "THuman2.1 near": ((27.09, 0.950, 0.062), (27.19, 0.950, 0.054)),
-    "AvatarReX": ((25.20, 0.960, 0.044), (25.24, 0.960, 0.040)),
-    "THuman4.0": ((25.42, 0.960, 0.034), (25.53, 0.960, 0.029)),
-}
-"""1 Gaussian a vertex, and 1 tight + 4 free."""
-FASTER_MODELLING = 15
-"""Times that HumanGS models faster than LHM: 4.59 s against 0.29."""
 
 
 class Variant(NamedTuple):
-    """against: the variant that it is compared with; None for those that others are compared with. claim: what that tests."""
+    """photos: that it is trained with. about: what it tests; "": a system. fields: of its `TrainConfig`."""
 
-    config: Any
-    against: str | None = None
-    claim: str = ""
+    model: HumanGSConfig
+    photos: int = PHOTOS
+    about: str = ""
+    fields: Mapping[str, Any] = {}
 
 
-def variants(steps: int) -> dict[str, Variant]:
+def variants() -> dict[str, Variant]:
     """All that `train_all.py` trains, by name, in the order of its queue."""
-
-    def run(model: Any, photos: int = PHOTOS, **fields: Any) -> Any:
-        capacity = -(-model.runtime.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
-        settings: dict[str, Any] = {
-            "model": model.with_runtime(token_capacity=capacity),
-            "views": ViewSampling(input_counts=(photos,)),
-            "loss": LossConfig(),
-            "optimizer": OptimizerConfig(learning_rate=1e-3, warmup_steps=min(50, steps // 4)),
-            "target_size": 128,
-            "steps": steps,
-            "validate_every": steps,
-            "checkpoint_every": min(100, steps),
-            "log_every": min(20, steps),
-        }
-        return TrainConfig(**(settings | fields))
-
-    systems = {name: make("bench") for name, make in SYSTEMS.items()}
-    ours, plain = systems["humangs"], systems["back_projection"]
-    encoder, reader, decoder = paper_parts(ours.architecture)
-    tight = lambda weight: run(ours, loss=LossConfig(tightness=weight))
-    per_vertex = lambda free: run(ours.with_parts(decoder=decoder.clone(tight=1, free=free)))
-    flat = reader.clone(shells=())
-    bare = ours.with_parts(reader=flat)
-    gray = {"reader": flat.clone(sample_rgb=False), "decoder": decoder.clone(residual_color=False)}
-    tokenless = encoder.clone(transformer=dataclasses.replace(encoder.transformer, class_token=False))
-    everywhere = ours.with_conventions(tokens="all").with_runtime(token_capacity=0)
-
-    def upsampled(features: Any) -> Any:
-        width = encoder.transformer.width
-        raised = encoder.clone(upsampler=UpsamplerConfig(width // 3, features))
-        return run(ours.with_parts(encoder=raised, reader=reader.clone(output_width=width)))
-
-    found = {
-        "back-projection": Variant(run(plain)),
-        "cross-attention": Variant(run(systems["cross_attention"]), "back-projection", "what reads the photos"),
-        "humangs": Variant(run(ours)),
-        "pooling over all views": Variant(run(ours.with_conventions(pool="all")), "humangs", "pooling"),
-        "no shells": Variant(run(bare), "humangs", "shells (ours)"),
-        "no global token": Variant(run(ours.with_parts(encoder=tokenless)), "humangs", "global token"),
-        "back-projection, another seed": Variant(run(plain, seed=1), "back-projection", NOISE),
-        "humangs, another seed": Variant(run(ours, seed=1), "humangs", NOISE),
-        "no photo colors": Variant(run(ours.with_parts(**gray)), "no shells", "photo colors (ours)"),
-        "canonical frame": Variant(
-            run(bare.with_parts(decoder=decoder.clone(frame="canonical"))), "no shells", "normal frame (ours)"
-        ),
-        "all tokens": Variant(run(everywhere), "humangs", "foreground tokens (ours)"),
-        "features of the last layer": Variant(upsampled("final")),
-        "features of four depths": Variant(upsampled("intermediate"), "features of the last layer", "depths"),
-        "1 Gaussian a vertex": Variant(per_vertex(0)),
-        "1 + 4 Gaussians a vertex": Variant(per_vertex(4), "1 Gaussian a vertex", "Gaussians a vertex"),
-        "1 + 8 Gaussians a vertex": Variant(per_vertex(8), "1 Gaussian a vertex", "Gaussians a vertex"),
-        "tightness 0": Variant(tight(0.0), "humangs", "tightness"),
-        "tightness 10": Variant(tight(10.0), "humangs", "tightness"),
-        "humangs, 1 photo": Variant(run(ours, 1)),
+    models = {name: make("bench") for name, make in SYSTEMS.items() if name not in PER_PERSON}
+    paper, ours = models.pop("humangs"), models.pop("ours")
+    encoder, reader, decoder = paper_parts(paper.architecture)
+    part = lambda about, **changes: Variant(paper.with_parts(**changes), about=about)
+    found = {REFERENCE: Variant(paper)}
+    found |= {name: Variant(model, 1 if name in TAKE_ONE else PHOTOS) for name, model in models.items()}
+    tokenless = dataclasses.replace(encoder.transformer, class_token=False)
+    upsampler = UpsamplerConfig(BENCH_WIDTH // 3, "final")
+    normal, shells = decoder.clone(frame="normal"), paper_parts(ours.architecture)[1].shells
+    return found | {
+        "one depth": part("features of four depths", encoder=encoder.clone(upsampler=upsampler)),
+        "no global token": part("global token", encoder=encoder.clone(transformer=tokenless)),
+        "1 Gaussian a vertex": part("1 + 4 Gaussians a vertex", decoder=decoder.clone(free=0)),
+        "pooling over all views": Variant(paper.with_conventions(pool="all"), about="pooling over visible views"),
+        "tightness 0": Variant(paper, about="tightness", fields={"loss": dataclasses.replace(LOSS, tightness=0.0)}),
+        "all additions": Variant(ours, about="ours"),
+        "photo colors": part("ours", reader=reader.clone(sample_rgb=True), decoder=decoder.clone(residual_color=True)),
+        "normal frame": part("ours", decoder=normal),
+        "shells and normal frame": part("ours", reader=reader.clone(shells=shells), decoder=normal),
+        "foreground tokens": Variant(paper.with_conventions(tokens="foreground"), about="ours"),
     }
-    for name, model in systems.items():
-        if name not in ("humangs", "back_projection", "cross_attention", *PER_PERSON):
-            alone = name in TAKE_ONE
-            against = "humangs, 1 photo" if alone else "humangs"
-            found[name] = Variant(run(model, 1 if alone else PHOTOS), against, "systems")
+
+
+LOSS = LossConfig(structural=0.0, structural_scales=1, silhouette=0.0, random_background=0.0)
+"""The paper's without its perceptual term."""
+
+
+def configuration(variant: Variant, seed: int, steps: int, perceptual: bool = False) -> TrainConfig:
+    """Of one round. The optimizer is the paper's but for its warm-up."""
+    photos = ViewSampling((variant.photos,), target_count=1, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
+    config = TrainConfig(
+        model=variant.model,
+        views=photos,
+        loss=LOSS,
+        optimizer=OptimizerConfig(warmup_steps=min(50, steps // 4)),
+        target_size=variant.model.image_size,
+        steps=steps,
+        batch_size=BATCH,
+        checkpoint_every=min(100, steps),
+        seed=seed,
+    )
+    config = dataclasses.replace(config, **variant.fields)
+    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, vgg16=1.0)) if perceptual else config
+
+
+def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
+    """What a variant is scored with: numbers of photos, "near" those of nearer cameras; several only where claims need them."""
+    if variant.photos == 1:
+        return ("1",)
+    several = name in (REFERENCE, "no global token", *SYSTEMS)
+    near = NEAR if name in ("lvsm", "humanram", "ghg", REFERENCE, "no global token", "1 Gaussian a vertex") else ()
+    return *(COUNTS if several else (str(PHOTOS),)), *near
+
+
+# One run ------------------------------------------------------------------------------------------------------------------
+
+
+def enough(curve: list[float], painted: float) -> bool:
+    """Whether a run needs no more rounds. curve: foreground PSNR of the validation people after each; that of vertex colors."""
+    return len(curve) >= MOST_ROUNDS or meets(curve, painted)
+
+
+def meets(curve: list[float], painted: float) -> bool:
+    """Whether a run is trained: `MARGIN` above the vertex colors, or above them and flat. Below networks stay white for long."""
+    flat = len(curve) > 1 and painted < curve[-1] < max(curve[:-1]) + FLAT
+    return flat or bool(curve and curve[-1] >= painted + MARGIN)
+
+
+def train_run(
+    variant: Variant, seed: int, out: Path, people: Path, row: dict[str, Any], painted: float, round_steps: int = ROUND
+) -> dict[str, Any] | None:
+    """The row of a run after one more round in the folder `out`; None if it was interrupted, and goes on there.
+
+    people: folders `train` and `validation` of `people.write_plain`. row: after the rounds before, {} at first. painted: what
+    the vertex colors reach.
+    """
+    curve, body, networks = row.get("curve", []), load_body(), load_loss_networks(installed=True)
+    number = len(curve) + (perceptual := enough(curve, painted))
+    if networks.vgg16 is None:
+        raise ValueError("the perceptual loss needs VGG-16: pip install humangs_jax[lpips]")
+    networks = networks if perceptual else LossNetworks()
+    config = configuration(variant, seed, round_steps // 4 if perceptual else round_steps, perceptual)
+    # what shows no other pose than that of the photos is not asked for one
+    one_pose, folder = not animatable(variant.model), out / str(number)
+    source = on_disk(people / "train", one_pose, recolored=True)
+    before = load_weights(out / str(number - 1) / "weights.safetensors")[0] if number else None
+    clock = folder / "seconds.json"
+    spent = json.loads(clock.read_text()) if clock.exists() else 0.0
+    start, interrupted = time.process_time(), False
+    # another seed also means other people at each step, and rounds do not repeat the steps before
+    config = dataclasses.replace(config, seed=100 * seed + number)
+    try:
+        state = train(config, body, source, folder, variables=before, networks=networks, progress=False)
+    except TrainingInterrupted as stopped:
+        state, interrupted = stopped.state, True
+    spent += time.process_time() - start
+    write_json(clock, spent)
+    if interrupted and int(state.step) < config.steps:
+        return None
+    trained, model = jax.device_get(state.variables), variant.model
+    score = tested(network(trained, model), people / "validation", variant.photos, animatable(model))
+    psnr = float(np.mean(score["reconstruction"]["psnr_fg"]))
+    return {
+        "curve": curve if perceptual else [*curve, psnr],
+        "validation": psnr,
+        "done": perceptual,
+        "photos": variant.photos,
+        "steps": row.get("steps", 0) + config.steps,
+        "operations": row.get("operations", 0) + operations(config, source, networks) * config.steps,
+        "parameters": sum(x.size for x in jax.tree.leaves(trained["params"])),
+        "cpu_seconds": row.get("cpu_seconds", 0.0) + spent,
+    }
+
+
+def operations(config: TrainConfig, source: Any, networks: Any) -> int:
+    """Of a step, forwards and backwards, as its program is written."""
+    state, body = jax.eval_shape(lambda: init_state(config)), gaussian_body(load_body(), config.model)
+    step = functools.partial(update, config=compiled_for(config))
+    batch = stage_loader(source, config, 0).batch_at(0)
+    return costs_of(jax.jit(step).trace(state, batch, body, networks, seed_numbers(0))).flops
+
+
+def network(variables: Any, model: HumanGSConfig) -> Method:
+    """What a network shows of a case."""
+    return lambda case, background: shown((variables, model), case, background)[0]
+
+
+def painted(case: Any, background: float) -> Predicted:
+    """The vertex-color baseline: vertices have the mean colors of the photos that see them, grey where none does."""
+    images = draw_painted_body(painted_body(case.inputs), case.truth)
+    return Predicted(np.clip(images, 0, 1), None, tuple(range(len(images))))
+
+
+def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict[str, Any]:
+    """Task -> score -> a number a person, of the people of a folder with held_out/, from so many photos."""
+    rows = evaluate(people, method=method, inputs=count, protocol=PROTOCOL).rows
+    found = {}
+    for task, first in zip(TASKS, (True, False), strict=True):
+        means = person_means([row for row in rows if (row.frame == 0) == first]).values()
+        if first or moves:
+            found[task] = {name: [round(x, 4) for row in means if (x := row[name]) is not None] for name in SCORES}
     return found
 
 
-def view_counts(name: str, config: Any) -> tuple[int, ...]:
-    """Numbers of photos that a variant is scored with; only those that claims about few photos need have several."""
-    if config.views.input_counts == (1,):
-        return (1,)
-    return (1, 2, PHOTOS, 6) if "global token" in name or name == "humangs" else (PHOTOS,)
+# Differences --------------------------------------------------------------------------------------------------------------
 
 
-def train_variant(
-    config: Any, out: Path, people: Any, body: Any, validation: Any, views: tuple[int, ...]
-) -> dict[str, Any] | None:
-    """Train in the folder `out`, or go on there, and score; None if it was interrupted.
+class Difference(NamedTuple):
+    """mean; half: of the 95 % interval, None where there is no second seed; seeds: of both; people."""
 
-    people: a `sources.MakeSource`; body: the model of theirs and of `validation`, a `CaptureCache`. Returns scores by number of
-    photos, steps, parameters, CPU and wall seconds of all calls.
+    mean: float
+    half: float | None
+    seeds: tuple[int, int]
+    people: int
+
+    def __str__(self) -> str:
+        """With its interval."""
+        return self.text()
+
+    def text(self, digits: int = 2) -> str:
+        """With its interval, if there is one."""
+        return f"{self.mean:+.{digits}f}" + ("" if self.half is None else f" +-{self.half:.{digits}f}")
+
+
+def difference(
+    runs: Mapping[str, Any],
+    a: tuple[str, int | str],
+    b: tuple[str, int | str],
+    task: str = "reconstruction",
+    score: str = "psnr_fg",
+) -> Difference:
+    """Of two variants, each (name, photos, see `tests_of`), over the same people.
+
+    Its variance is that over people of the paired differences, and that of seeds, which is pooled over all variants with several;
+    Student's t with the degrees of freedom of Welch and Satterthwaite.
     """
-    clock = out / "seconds.json"
-    before = json.loads(clock.read_text()) if clock.exists() else {"cpu": 0.0, "wall": 0.0}
-    cpu, wall = time.process_time(), time.perf_counter()
-    try:
-        state = train(config, body, people, out, progress=False)
-    except TrainingInterrupted as stopped:
-        state = stopped.state
-    spent = {"cpu": before["cpu"] + time.process_time() - cpu, "wall": before["wall"] + time.perf_counter() - wall}
-    write_json(clock, spent)
-    if int(state.step) < config.steps:
-        return None
-    variables = jax.device_get(state.variables)
-    by_views = {str(count): score(variables, gaussian_body(body, config.model), config, validation, count) for count in views}
-    return {
-        "by_views": by_views,
-        "photos": config.views.input_counts[0],
-        "steps": config.steps,
-        "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
-        "cpu_seconds": round(spent["cpu"], 1),
-        "wall_seconds": round(spent["wall"], 1),
-    }
+    values = lambda name, photos: np.asarray([x["scores"][str(photos)][task][score] for x in finished(runs, name)])
+    first, second = values(*a), values(*b)
+    paired = first.mean(axis=0) - second.mean(axis=0)
+    people, (seeds, freedom) = np.var(paired, ddof=1) / len(paired), seed_variance(runs, task, score)
+    count = len(first), len(second)
+    if not freedom:
+        return Difference(float(paired.mean()), None, count, len(paired))
+    seeds = seeds * (1 / count[0] + 1 / count[1])
+    total = people + seeds
+    degrees = total**2 / (people**2 / (len(paired) - 1) + seeds**2 / freedom) if total else 1.0
+    half = float(student.ppf(0.975, degrees) * np.sqrt(total))
+    return Difference(float(paired.mean()), half, count, len(paired))
 
 
-def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> dict[str, float]:
-    """Means over people of `TARGETS` views each, with that number of photos."""
-    compared = dataclasses.replace(
-        config,
-        model=config.model.with_runtime(token_capacity=0),
-        views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
-    )
-    examples = validation_examples(cached_people(people), compared, len(people))
-    numbers, _ = validate(variables, body, examples, compared)
-    names = (*SCORES, "semi_transparent", "dropped_tokens", "overflow")
-    # JSON has no NaN: networks that draw pixels have no semi-transparent foreground
-    return {name: x for name in names if (x := numbers[name]) == x}
+def seed_variance(runs: Mapping[str, Any], task: str, score: str) -> tuple[float, int]:
+    """Variance of a run's mean by its seed, and its degrees of freedom."""
+    squares, freedom = 0.0, 0
+    for name in runs:
+        means = [np.mean(own[task][score]) for x in finished(runs, name) if task in (own := headline(x))]
+        if len(means) > 1:
+            squares, freedom = squares + np.var(means) * len(means), freedom + len(means) - 1
+    return (squares / freedom if freedom else 0.0), freedom
 
 
-def headline(row: Mapping[str, Any]) -> dict[str, float]:
+def finished(runs: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    """The runs of a variant that have test scores, by seed."""
+    return [row for _, row in sorted(runs.get(name, {}).items()) if "scores" in row]
+
+
+def headline(row: Mapping[str, Any]) -> dict[str, Any]:
     """The scores of a run with as many photos as it was trained with."""
-    return row["by_views"][str(row["photos"])]
+    return row["scores"][str(row["photos"])]
 
 
-def seed_interval(rows: Mapping[str, Any], score: str = "psnr_fg") -> float | None:
-    """Half of the 95 % interval, in dB, of a difference between two runs, by their seeds alone; None without a pair of seeds.
-
-    From the pairs of runs that differ in their seed alone: Student's t with as many degrees of freedom as pairs, which takes
-    into account that they are few. It says nothing about other people.
-    """
-    pairs = [(name, name.removesuffix(", another seed")) for name in rows if name.endswith(", another seed")]
-    found = [headline(rows[a])[score] - headline(rows[b])[score] for a, b in pairs if b in rows]
-    if not found:
-        return None
-    return float(t.ppf(0.975, len(found))) * math.sqrt(sum(x * x for x in found) / len(found))
+def is_trained(row: Mapping[str, Any], painted: float) -> bool:
+    """Whether a run is done and meets the criterion. painted: foreground PSNR of the vertex-color baseline, dB."""
+    return row["done"] and meets(row["curve"], painted)
 
 
-def verdict(difference: float, interval: float | None) -> str:
-    """What a difference is worth beside its interval."""
-    if interval is None:
-        return "noise unknown"
-    return "within noise" if abs(difference) <= interval else "better" if difference > 0 else "worse"
-
-
-def untrained(rows: Mapping[str, Any], painted: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the runs that have learned too little for a comparison: `MARGIN` over the vertex-color baseline is not reached.
-
-    painted: its scores by number of photos, of the same people and views. That of `PHOTOS` counts for all.
-    """
-    least = painted[str(PHOTOS)]["psnr_fg"] + MARGIN
-    return [name for name, row in rows.items() if headline(row)["psnr_fg"] < least]
+def trained_names(report: Mapping[str, Any]) -> list[str]:
+    """Variants of which a run meets it and has scores."""
+    painted = report["painted"]["validation"]
+    return [name for name, own in report["runs"].items() if any("scores" in x and is_trained(x, painted) for x in own.values())]
 
 
 def results(name: str) -> Any:
@@ -267,49 +315,7 @@ def results(name: str) -> Any:
     return json.loads((PAGE.parent / "results" / f"{name}.json").read_text())["numbers"]
 
 
-def untrained_on_the_page() -> list[str]:
-    """`untrained` of what docs/paper.md shows."""
-    return untrained(results("paper")["runs"], results(PAINTED_TABLE)["validation"])
-
-
-# Trained systems on people of a folder -----------------------------------------------------------------------------------
-
-QUICK_PEOPLE, QUICK_SIZE = 2, 128
-
-
-@dataclasses.dataclass(frozen=True)
-class Tested:
-    """Options:
-    runs: the OUT of `paper`; without it the shipped weights alone
-    people: captures with held_out/, or any data set (docs/datasets.md)
-    body: body model of a data set
-    lpips: weights of LPIPS vgg: BACKBONE and HEADS
-    quick: two synthetic people of 128 pixels, made in a minute
-    """
-
-    runs: Path | None = None
-    people: Path | None = None
-    body: Path | None = None
-    lpips: tuple[Path, ...] = ()
-    quick: bool = False
-
-    def with_people(self, folder: Path) -> Self:
-        """With the small people made in a folder, if none were given. Raises: ValueError where neither is asked for."""
-        if not (self.people or self.quick):
-            raise ValueError("--people is needed, or --quick")
-        return self if self.people else dataclasses.replace(self, people=quick_people(folder / "people"))
-
-
-def quick_people(folder: Path, split: str = "test") -> Path:
-    """Small synthetic captures: 12 photos of one pose, held-out views of it and of another pose."""
-    write_set(folder, QUICK_PEOPLE, Layout(QUICK_SIZE, views=12, held_out_views=2, novel_poses=1), split)
-    return folder
-
-
-def load_networks(paths: Any) -> tuple[Any, ...]:
-    """LPIPS for the evaluator, or nothing."""
-    found = load_loss_networks(None, paths[0], paths[1] if len(paths) > 1 else None, "vgg").lpips if paths else None
-    return () if found is None else (found,)
+# Trained systems --------------------------------------------------------------------------------------------------------
 
 
 def folder_of(name: str) -> str:
@@ -317,48 +323,9 @@ def folder_of(name: str) -> str:
     return name.replace(" ", "_").replace(",", "").replace("+", "and")
 
 
-def trained(runs: Path | None, names: Any = None) -> dict[str, tuple[Any, Any]]:
-    """(variables, configuration) by name: the variants whose training is finished, and the shipped weights."""
-    found = {}
-    if runs is not None:
-        finished = json.loads((runs / "results.json").read_text())["runs"]
-        for name in finished if names is None else [name for name in names if name in finished]:
-            found[name] = load_weights(runs / folder_of(name) / "weights.safetensors")
-    return found | {SHIPPED: load_weights()}
-
-
-def measured(
-    weights: tuple[Any, Any], people: Path, photos: int, body: Path | None, networks: Any, indices: Any = None
-) -> dict[str, Any] | None:
-    """Scores of the views in the pose of the photos and in others, and the seconds to model and to draw a frame.
-
-    None if the system takes no such number of photos. The first person is run twice, and only the second run is timed: the first
-    one compiles.
-    """
-    config = weights[1]
-    if takes_one(config) and photos > 1:
-        return None
-    seconds: dict[str, list[float]] = {"model": [], "frame": []}
-
-    def method(case: Any, background: float) -> Any:
-        if not seconds["frame"]:
-            shown(weights, case, background)
-        predicted, modelled, drawn = shown(weights, case, background)
-        seconds["model"].append(modelled)
-        seconds["frame"].append(drawn / case.truth.view_count)
-        return predicted
-
-    found = evaluate(people, method=method, inputs=None if indices else photos, indices=indices, lpips=networks, body=body)
-    means: dict[str, Any] = {"photos": photos}
-    for task, rows in (
-        ("reconstruction", [row.scores for row in found.rows if row.frame == 0]),
-        ("animation", [row.scores for row in found.rows if row.frame != 0]),
-    ):
-        means[task] = mean_scores(rows) if rows and (task == "reconstruction" or animatable(config)) else None
-    per_target = config.architecture.driver is not None
-    means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
-    means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
-    return means
+def last_weights(run: Path) -> Path:
+    """Of the last round in the folder of a run."""
+    return max(run.glob("*/weights.safetensors"), key=lambda path: int(path.parent.name))
 
 
 def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple[Any, float, float]:
@@ -383,12 +350,3 @@ def animatable(config: Any) -> bool:
     """Whether a system can show a pose that no photo shows: LVSM knows no body."""
     driver = config.architecture.driver
     return not (isinstance(driver, QueryDriver) and driver.texture is None)
-
-
-def triple(scores: Any) -> str:
-    """PSNR / SSIM / LPIPS of a measured row or of a printed one; a dash where it is missing."""
-    if scores is None:
-        return "-"
-    values = scores if isinstance(scores, tuple) else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
-    texts = [f"{value:.{digits}f}" if value is not None else "-" for value, digits in zip(values, (2, 3, 3), strict=True)]
-    return " / ".join(texts)

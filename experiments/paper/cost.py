@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry, figure
-from experiments.paper.bench import ANIMATION, FASTER_MODELLING, OURS
+from experiments.paper.rows import ANIMATION, FASTER_MODELLING, OURS
 from experiments.results import REPOSITORY, markdown_table, significant
 from experiments.systems import SYSTEMS, back_projection
 from experiments.systems.cross_attention import CrossAttentionReader

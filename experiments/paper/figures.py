@@ -12,34 +12,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.harness import Run, entry, figure
-from experiments.paper.bench import (
-    ABLATIONS,
-    ONE_PHOTO,
-    PHOTOS,
-    SHIPPED,
-    VIEW_COUNTS,
-    Tested,
-    load_networks,
-    measured,
-    shown,
-    takes_one,
-    trained,
-    untrained_on_the_page,
-)
+from experiments.paper.bench import PHOTOS, REFERENCE, VIEW_COUNTS, shown, takes_one, variants
+from experiments.paper.rows import SHIPPED, Tested, load_networks, measured, trained, views_of
 from experiments.results import markdown_table
 from humangs_jax.avatar.frames import draw
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.evaluation.cases import find_people, weights_method
 from humangs_jax.io.images import write_png
 from humangs_jax.losses.perceptual import lpips
 
-TOKENS = ("humangs", "no global token")
-DEPTHS = ("features of the last layer", "features of four depths")
+TOKENS = (REFERENCE, "no global token")
+DEPTHS = ("one depth", REFERENCE)
 PATCHES = 8
 """Patches along a side of an image: 64 of 512 pixels."""
+LEAST = 16
+"""Pixels a side of the smallest patch that LPIPS takes; smaller ones are compared by squared errors."""
 SHOWN = 4
 """People, and poses, on the sheet of driven people."""
 ACROSS = 8
@@ -59,18 +47,18 @@ def paper_figures(
 
     varying: PSNR of novel poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; token: PSNR
     with and without the global token over photos; features: histogram of what the features of four depths change in a patch of
-    64 x 64 pixels of 512 more than half of which is the person (LPIPS where --lpips is given, squared error otherwise); driven:
+    64 x 64 pixels of 512 more than half of which is the person (LPIPS where patches are large enough); driven:
     people in the poses of other people; systems: the first person by every system of the bench that is trained.
 
     Options:
     out: folder of the images
     motions: captures whose poses drive the others; default: each other
-    poses: captures of several poses, for `varying`; default: --people
+    poses: captures of several poses, for `varying`; default: --data
     only: which figures
     """
     with tempfile.TemporaryDirectory() as folder:
         options = options.with_people(Path(folder))
-        systems, networks = trained(options.runs), load_networks(options.lpips)
+        systems, networks = trained(options.runs, options.weights), load_networks(options.lpips)
         out.mkdir(parents=True, exist_ok=True)
         given = SimpleNamespace(**vars(options), out=out, motions=motions, varying=poses)
         numbers = {name: FIGURES[name](systems, networks, given) for name in only or FIGURES}
@@ -92,7 +80,7 @@ def text_of(numbers: Mapping[str, Any]) -> str:
     texts = [markdown_table(["PSNR, dB, by photos", "photos show", *counts], rows, "ll" + "r" * len(counts))]
     if found := numbers.get("features"):
         said = f"mean {found['mean']:.1e}, skewness {found['skewness']:+.2f}"
-        texts.append(f"Squared error without - with features of four depths, {found['patches']} patches: {said}.")
+        texts.append(f"Without - with features of four depths, {found['kind']}, {found['patches']} patches: {said}.")
     return "\n\n".join(texts)
 
 
@@ -104,31 +92,19 @@ def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> boo
     return not missing
 
 
-def varying(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, dict[int, float]]:
+def varying(systems: dict[str, Any], networks: Any, options: Any) -> dict[str, dict[int, float]]:
     """Unseen poses from photos of varying poses."""
-    people = arguments.varying or arguments.people
+    people = options.varying or options.data
     curves: dict[str, dict[int, float]] = {}
-    for name in (name for name in ("humangs", "cross-attention", SHIPPED) if name in systems):
+    for name in systems:
         for count in (1, 2, 4, 6):
-            indices = varied(people, count)
-            found = measured(systems[name], people, count, arguments.body, networks, indices)
+            found = measured(
+                systems[name], people, count, options.body, networks, views_of(people, count, options.body, varying=True)
+            )
             if found is not None and (scores := found["animation"] or found["reconstruction"]):
                 curves.setdefault(name, {})[count] = scores["psnr"]
-    draw_curves(curves, arguments.out / "varying.png", "photos of varying poses")
+    draw_curves(curves, options.out / "varying.png", "photos of varying poses")
     return curves
-
-
-def varied(people: Path, count: int) -> dict[str, dict[str, list[int]]] | None:
-    """Views of as many frames as there are, in turns, for captures without held_out/; None: as the evaluator chooses."""
-    chosen = {}
-    for folder in find_captures(people) if people.is_dir() else []:
-        if (folder / "held_out").is_dir():
-            return None
-        frames = np.asarray(load_capture(folder).frames)
-        seen = sorted(set(frames.tolist()))[:-1] or [0]  # the last pose is unseen
-        context = [int(np.flatnonzero(frames == seen[i % len(seen)])[i // len(seen)]) for i in range(count)]
-        chosen[folder.name] = {"context": context, "target": np.flatnonzero(frames == frames.max()).tolist()}
-    return chosen or None
 
 
 def token(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, dict[int, float]]:
@@ -138,7 +114,7 @@ def token(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, d
         for name in TOKENS:
             for count in VIEW_COUNTS:
                 try:
-                    found = measured(systems[name], arguments.people, count, arguments.body, networks)
+                    found = measured(systems[name], arguments.data, count, arguments.body, networks)
                 except ValueError as error:  # not as many photos that are evenly spaced
                     print(f"token: {error}", file=sys.stderr)
                     continue
@@ -148,11 +124,11 @@ def token(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, d
     return curves
 
 
-def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, float]:
+def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, Any]:
     """What the features of four depths change, by patches."""
     if not present(systems, DEPTHS, "features"):
         return {}
-    people, changes = find_people(arguments.people, PHOTOS, None, arguments.body), []
+    people, changes, kind = find_people(arguments.data, PHOTOS, None, arguments.body), [], "squared error"
     methods = [weights_method(*systems[name]) for name in DEPTHS]
     for index in range(len(people.names)):
         case = people.load(index)
@@ -161,15 +137,16 @@ def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str
         without, with_them = (method(case, 1.0).images for method in methods)
         for truth, mask, a, b in zip(case.truth.images, case.truth.masks, without, with_them, strict=True):
             side = max(1, truth.shape[0] // PATCHES)
-            error = patch_lpips(networks[0]) if networks else patch_error
+            kind = "LPIPS" if networks and side >= LEAST else "squared error"
+            error = patch_lpips(networks[0]) if kind == "LPIPS" else patch_error
             changes += [error(truth, a, box) - error(truth, b, box) for box in patches(mask, side)]
     with figure(arguments.out / "features.png", size=(5, 3.4)) as axes:
         axes.hist(changes, bins=60, color="#1f6f8b")
         axes.axvline(0, color="black", linewidth=0.8)
-        axes.set_xlabel(f"{'LPIPS' if networks else 'squared error'} without - with features of four depths")
+        axes.set_xlabel(f"{kind} without - with features of four depths")
     centred = np.asarray(changes) - np.mean(changes)
     skew = float(np.mean(centred**3) / max(np.mean(centred**2) ** 1.5, 1e-30))
-    return {"patches": len(changes), "mean": float(np.mean(changes)), "skewness": skew}
+    return {"kind": kind, "patches": len(changes), "mean": float(np.mean(changes)), "skewness": skew}
 
 
 def patches(mask: np.ndarray, side: int) -> list[tuple[slice, slice]]:
@@ -192,8 +169,8 @@ def patch_lpips(network: Any) -> Callable[..., float]:
 
 def driven(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, list[str]]:
     """A row a person: one photo, then the person in poses of others, seen from the camera of that photo."""
-    weights = systems.get("humangs", systems[SHIPPED])
-    people = find_people(arguments.people, PHOTOS, None, arguments.body)
+    weights = systems.get(REFERENCE, systems[SHIPPED])
+    people = find_people(arguments.data, PHOTOS, None, arguments.body)
     others = find_people(arguments.motions, PHOTOS, None, arguments.body) if arguments.motions else people
     rows = []
     for index in range(min(SHOWN, len(people.names))):
@@ -218,12 +195,12 @@ def driven(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, 
 
 def systems_shown(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, list[str]]:
     """A column a system, the truth first."""
-    left_out = {SHIPPED, *untrained_on_the_page()}  # the shipped weights were trained far longer
-    names = [name for name in systems if name not in left_out and not any(mark in name for mark in ABLATIONS)]
+    left_out = {SHIPPED, *(name for name, variant in variants().items() if variant.about)}  # the first was trained far longer
+    names = [name for name in systems if name not in left_out]
     columns: dict[str, Any] = {}
     for name in names:
-        photos = 1 if takes_one(systems[name][1]) or name.endswith(ONE_PHOTO) else PHOTOS
-        case = find_people(arguments.people, photos, None, arguments.body).load(0)
+        photos = 1 if takes_one(systems[name][1]) else PHOTOS
+        case = find_people(arguments.data, photos, None, arguments.body).load(0)
         frames = np.asarray(case.truth.frames)
         views = sorted({int(np.argmax(frames == frame)) for frame in (frames.min(), frames.max())})
         columns["truth"] = [case.truth.images[view] for view in views]

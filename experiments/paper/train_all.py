@@ -1,7 +1,5 @@
-"""Trains the paper's systems and ablations one after the other at bench size (128 pixels)."""
+"""Trains the variants of the bench one after the other, and scores them."""
 
-import dataclasses
-import json
 import os
 import signal
 import sys
@@ -11,183 +9,215 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from experiments.harness import Run, entry
 from experiments.paper.bench import (
+    COUNTS,
     MARGIN,
-    NOISE,
+    NEAR,
     NOT_TRAINED,
     PAINTED,
-    PAINTED_TABLE,
     PHOTOS,
+    REFERENCE,
+    ROUND,
     SCORES,
+    SEEDS,
+    Difference,
+    animatable,
+    difference,
+    finished,
     folder_of,
     headline,
-    results,
-    seed_interval,
-    train_variant,
-    untrained,
+    is_trained,
+    last_weights,
+    network,
+    painted,
+    tested,
+    tests_of,
+    train_run,
+    trained_names,
     variants,
-    verdict,
-    view_counts,
 )
+from experiments.paper.people import SIZE, write_plain
 from experiments.results import markdown_table, write_json
-from experiments.subjects import file_digest
-from humangs_jax.body.library import load_body
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.loading import CaptureCache, find_captures
-from humangs_jax.people.bank import build_bank, load_bank, save_bank
-from humangs_jax.people.subject import seeds_of
-from humangs_jax.people.writer import Layout, write_set
-from humangs_jax.training.sources import on_the_fly_people, people_on_disk
+from humangs_jax.core.compiling import enable_compile_cache
+from humangs_jax.io.reading import read_json
+from humangs_jax.network.weights import load_weights
 
-
-@dataclasses.dataclass(frozen=True)
-class Bench:
-    """Options:
-    budget: hours that this call may take; default: no limit
-    steps: of each variant; another number is another OUT
-    people: people of the bank that is made
-    first: number of the first of them among the training seeds
-    bank: the people.npz of another run instead
-    data: captures or a data set (docs/datasets.md) to train on instead
-    body: body model of --data and --validation
-    validation: captures of other people; default: they are made
-    validated: how many of them
-    only: names of the variants to train; default: all
-    quick: 20 steps of the first two variants on 4 people
-    """
-
-    budget: float | None = None
-    steps: int = 3000
-    people: int = 64
-    first: int = 0
-    bank: Path | None = None
-    data: Path | None = None
-    body: Path | None = None
-    validation: Path | None = None
-    validated: int = 8
-    only: tuple[str, ...] = ()
-    quick: bool = False
+VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
 
 
 @entry
-def paper(run: Run, out: Path, bench: Bench = Bench(), names_only: bool = False) -> None:
-    """Trains the paper's systems and ablations at bench size (128 pixels), one after the other, and compares them.
+def paper(
+    run: Run,
+    out: Path,
+    budget: float | None = None,
+    round_steps: int = ROUND,
+    people: int = 192,
+    test_people: int = 32,
+    seeds: int = SEEDS,
+    only: tuple[str, ...] = (),
+    train: bool = True,
+    quick: bool = False,
+) -> None:
+    """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets its criterion.
 
-    Each variant has the same number of steps, people, views and losses; the learning rate ends at 0. What is done stays in OUT:
-    finished variants are not repeated, an unfinished one goes on from its last checkpoint, also after Ctrl-C or a kill. 3,000
-    steps take some 30 minutes of two cores a variant, and two seeds of two of them say how large noise is: a difference inside
-    its 95 % interval is called so. People are rendered on the fly from a bank of training seeds, the same ones for all; scores
-    are of validation people: captures with at least 4 + 6 views of one pose. Both are made once in OUT unless given.
+    What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in OUT: the same command goes on
+    there, also after a kill, from the last checkpoint. The reference comes first, then a seed of each system, more seeds of the
+    reference, the ablations, more seeds of all. CPU seconds are of calls that were not killed; operations are of all steps.
 
     Options:
-    out: folder of the runs and of results.json
-    names_only: print the variants and end
+    out: folder of the people, the runs and results.json
+    budget: hours that this call may take; default: no limit
+    round_steps: of each round; another number is another OUT
+    people: to train on; as many cost 3 minutes
+    test_people: to compare on
+    seeds: of each variant
+    only: names of the variants to train; default: all
+    train: --no-train shows what is done
+    quick: 4 people, rounds of 4 steps, two variants
     """
-    if bench.data is not None and bench.validation is None:
-        raise ValueError("--data needs --validation: people of the same kind to compare on")
-    if bench.steps < 1 or bench.people < 1 or (bench.budget is not None and bench.budget <= 0):
-        raise ValueError("--steps and --people must be at least 1, --budget positive")
-    if bench.quick:
-        bench = dataclasses.replace(bench, steps=20, people=4, validated=2)
-    queue = variants(bench.steps)
-    if names_only:
-        print("\n".join(queue))
-        return
-    names = bench.only or list(queue)[: 2 if bench.quick else None]
-    if unknown := [name for name in names if name not in queue]:
-        raise ValueError(f"--only {unknown[0]!r}: expected names of {', '.join(queue)}")
-    if bench.budget is not None:
-        timer = threading.Timer(3600 * bench.budget, os.kill, (os.getpid(), signal.SIGTERM))
-        timer.daemon = True
-        timer.start()
-    bank, folder = made_people(out, bench)
-    folders = find_captures(folder)[: bench.validated]
-    trained_on = str(bench.data) if bank is None else file_digest(bank)
-    settings = {"steps": bench.steps, "people": trained_on, "validation": [x.name for x in folders]}
-    path, body = out / "results.json", FileBody.load(bench.body)
-    rows = kept(path, settings)
-    people = people_on_disk(bench.data or out, body) if bank is None else on_the_fly_people(load_bank(bank))
-    unseen = CaptureCache(folders, body.model)
-    for name in (name for name in names if name not in rows):
-        config = queue[name].config
-        row = train_variant(config, out / folder_of(name), people, body.model, unseen, view_counts(name, config))
-        if row is None:
-            print(f"interrupted in {name!r}: the same command goes on there", file=sys.stderr)
-            break
-        rows = kept(path, settings) | {name: row}  # another process may have added to it
-        write_json(path, {"settings": settings, "runs": rows})
-        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in headline(row).items()), flush=True)
+    if round_steps < 4 or people < 1 or test_people < 2 or seeds < 1 or (budget is not None and budget <= 0):
+        raise ValueError("--round-steps must be at least 4, --test-people 2, --people and --seeds 1, --budget positive")
+    if quick:
+        round_steps, people, test_people, seeds, only = 4, 4, 2, 1, only or (REFERENCE, "lvsm")
+    known = variants()
+    if unknown := [name for name in only if name not in known]:
+        raise ValueError(f"--only {unknown[0]!r}: expected names of {', '.join(known)}")
+    settings = {"round_steps": round_steps, "people": people, "test_people": test_people}
+    path, place = out / "results.json", out / "people"
+    report = kept(path, settings)
+    if train:
+        enable_compile_cache(out / "cache")
+        if budget is not None:
+            timer = threading.Timer(3600 * budget, os.kill, (os.getpid(), signal.SIGTERM))
+            timer.daemon = True
+            timer.start()
+        write_plain(place / "validation", "validation", min(VALIDATED, test_people), VIEWS, HELD_OUT_VIEWS)
+        write_plain(place / "test", "test", test_people, VIEWS, HELD_OUT_VIEWS)
+        write_plain(place / "near", "test", test_people, VIEWS, HELD_OUT_VIEWS, near=True)
+        write_plain(place / "train", "train", people, TRAIN_VIEWS, size=2 * SIZE)  # the loader averages
+        if not report["painted"]:
+            seen = tested(painted, place / "validation", PHOTOS)["reconstruction"]["psnr_fg"]
+            test = {str(PHOTOS): tested(painted, place / "test", PHOTOS)}
+            report["painted"] = {"validation": float(np.mean(seen)), "test": test}
+            write_json(path, report)
+        for name, seed in (x for x in queue(seeds) if x[0] in (only or known)):
+            if not finish(name, seed, out, report):
+                print(f"interrupted in {name!r}, seed {seed}: the same command goes on there", file=sys.stderr)
+                break
+    if report["runs"]:
+        run.show(table(report), report | {"differences": differences(report), "ablations": ablations(report)})
+
+
+def queue(seeds: int) -> list[tuple[str, int]]:
+    """Runs, the most wanted ones first: of systems a seed before a second one of any."""
+    systems = [name for name, variant in variants().items() if not variant.about]
+    others = [name for name, variant in variants().items() if variant.about]
+    more = [(REFERENCE, seed) for seed in range(1, seeds)]
+    order = [(name, 0) for name in systems] + more + [(name, 0) for name in others]
+    return order + [x for seed in range(1, seeds) for name in (*systems, *others) if (x := (name, seed)) not in more]
+
+
+def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
+    """Bring a run to its end and score it; the report is written after each round. False if it was interrupted."""
+    variant, place = variants()[name], out / folder_of(name) / str(seed)
+    rows = report["runs"].setdefault(name, {})
+    while "scores" not in (row := rows.get(str(seed), {})):
+        if not row.get("done"):
+            least, steps = report["painted"]["validation"], report["settings"]["round_steps"]
+            row = train_run(variant, seed, place, out / "people", row, least, steps)
+            if row is None:
+                return False
+            print(f"{name}, seed {seed}: {row['steps']} steps, foreground {row['validation']:.2f} dB", flush=True)
+        else:
+            method = network(load_weights(last_weights(place))[0], variant.model)
+            scores = {}
+            for test in tests_of(name, variant):
+                folder = out / "people" / ("near" if test in NEAR else "test")
+                scores[test] = tested(method, folder, int(test.split()[-1]), animatable(variant.model))
+            row = row | {"scores": scores}
+        rows[str(seed)] = row
+        write_json(out / "results.json", report)
         jax.clear_caches()
-    if rows:
-        painted = results(PAINTED_TABLE)["validation"] if run.publish else None
-        run.show(table(rows, queue, settings, painted), {"settings": settings, "runs": rows})
-
-
-def made_people(out: Path, bench: Bench) -> tuple[Path | None, Path]:
-    """The bank of people to train on (None with --data), and the folder of those to compare on; made in OUT unless given."""
-    out.mkdir(parents=True, exist_ok=True)
-    bank, folder = bench.bank, bench.validation
-    if bank is None and bench.data is None:
-        bank = out / "people.npz"
-        if not bank.is_file():
-            seeds = seeds_of("train", bench.first, bench.people)
-            save_bank(bank, build_bank(seeds, load_body(), "train", processes=os.cpu_count() or 1, progress=True))
-    if folder is None:
-        folder = out / "validation"
-        write_set(folder, bench.validated, Layout(128, poses=2, views=12), "validation")
-    return bank, folder
+    return True
 
 
 def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The runs in a file, {} without a file. Raises: ValueError if they had other settings."""
+    """The report in a file, an empty one without a file. Raises: ValueError if it has other settings."""
     if not path.is_file():
-        return {}
-    report = json.loads(path.read_text())
+        return {"settings": dict(settings), "painted": {}, "runs": {}}
+    report = read_json(path)
     if report["settings"] != settings:
         raise ValueError(f"{path} has runs of other settings, {report['settings']}: give another OUT")
-    return report["runs"]
+    return report
 
 
-def table(
-    rows: Mapping[str, Any],
-    queue: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    painted: Mapping[str, Any] | None = None,
-) -> str:
-    """A row a variant, with its difference to what it is compared with; below, what another seed changes.
-
-    painted: scores of the vertex-color baseline by number of photos; runs that hardly beat it are marked as not trained.
-    """
-    lines, interval = [], seed_interval(rows)
-    gray = untrained(rows, painted) if painted else ()
-    for name in (name for name in queue if name in rows):
-        row, against = rows[name], queue[name].against
-        scores = headline(row)
-        cells: list[object] = [name, row["photos"]]
-        cells += [f"{scores[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
-        if against in rows:
-            change = scores["psnr_fg"] - headline(rows[against])["psnr_fg"]
-            said = NOISE if queue[name].claim == NOISE else verdict(change, interval)
-            cells += [against, f"{change:+.2f}", NOT_TRAINED if name in gray or against in gray else said]
-        else:
-            cells += ["", "", NOT_TRAINED if name in gray else ""]
-        lines.append([*cells, f"{row['parameters'] / 1e6:.2f}", row["steps"], f"{row['cpu_seconds']:.0f}"])
-    header = ["variant", "photos", *(heading for heading, _ in SCORES.values())]
-    header += ["against", "difference of foreground PSNR, dB", "", "M parameters", "steps", "CPU s"]
-    text = markdown_table(header, lines, "lr" + "r" * len(SCORES) + "lrlrrr")
-    said = f"Means over {len(settings['validation'])} unseen people."
-    if interval is not None:
-        said += f" 95 % interval of a difference by the seeds of training alone: +-{interval:.2f} dB; within it: noise."
-    if painted:
-        said += f' "{NOT_TRAINED}": less than {MARGIN:g} dB of foreground PSNR over the {PAINTED} of {PHOTOS} photos.'
-    texts = [text, said]
-    counted = {name: row["by_views"] for name, row in rows.items() if len(row["by_views"]) > 1}
+def table(report: Mapping[str, Any]) -> str:
+    """A row a variant, with its difference to the reference; those that have not met the criterion say how far they came."""
+    runs, least, lines, counted, changes = report["runs"], report["painted"]["validation"], [], [], differences(report)
+    for name, own in ((name, own) for name, own in runs.items() if own):
+        rows, steps = finished(runs, name), max(x["steps"] for x in own.values())
+        spent = {"operations": 1e12, "cpu_seconds": 60}
+        compute = [f"{sum(x[key] for x in own.values()) / unit:.2g}" for key, unit in spent.items()]
+        last = next(iter(own.values()))
+        if not rows or not is_trained(rows[0], least):
+            said = f"{NOT_TRAINED}: {steps} steps, {last['validation']:.2f} dB in validation"
+            lines.append([name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute])
+            continue
+        means = {key: np.mean([headline(x)["reconstruction"][key] for x in rows]) for key in SCORES}
+        scores = [f"{means[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
+        moved = "-"
+        if "animation" in headline(rows[0]):
+            moved = f"{np.mean([headline(x)['animation']['psnr_fg'] for x in rows]):.2f}"
+        lines.append([name, last["photos"], len(rows), *scores, moved, str(changes.get(name, "")), steps, *compute])
+        for kind in (COUNTS, NEAR):
+            if set(kind) <= set(rows[0]["scores"]):
+                means = [np.mean([x["scores"][test]["reconstruction"]["psnr_fg"] for x in rows]) for test in kind]
+                counted.append([name, "near" if kind == NEAR else "standard", *(f"{x:.2f}" for x in means)])
+    base = report["painted"]["test"]
+    shown = [f"{np.mean(base[str(PHOTOS)]['reconstruction'][key]):.{digits}f}" for key, (_, digits) in SCORES.items()]
+    moved = f"{np.mean(base[str(PHOTOS)]['animation']['psnr_fg']):.2f}"
+    lines.append([PAINTED, PHOTOS, "", *shown, moved, "", "", "", ""])
+    header = ["variant", "photos", "seeds", *(heading for heading, _ in SCORES.values()), "another pose, foreground"]
+    header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
+    settings = report["settings"]
+    said = (
+        f"{settings['test_people']} test people; rounds of {settings['round_steps']} steps, a last quarter of one with the "
+        "perceptual loss. "
+        f"Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on the validation people, or "
+        f'where a run is flat; "{NOT_TRAINED}": it has not got there. Intervals: 95 %, over people and seeds.'
+    )
+    texts = [markdown_table(header, lines), said]
     if counted:
-        counts = sorted({int(count) for own in counted.values() for count in own})
-        shown = [
-            [name, *(f"{own[str(c)]['psnr_fg']:.2f}" if str(c) in own else "" for c in counts)] for name, own in counted.items()
-        ]
-        texts.append(markdown_table(["foreground PSNR, dB, by photos", *map(str, counts)], shown))
+        texts.append(markdown_table(["foreground PSNR, dB, by photos", "cameras", *COUNTS], counted, "llrrrr"))
+    if parts := ablations(report):
+        texts += ["The paper's ablations, PSNR in dB and LPIPS (a gain is positive):", markdown_table(*parts)]
     return "\n\n".join(texts)
+
+
+def differences(report: Mapping[str, Any]) -> dict[str, Difference]:
+    """To the reference, of the foreground in the pose of the photos, each trained variant with its own number of photos."""
+    runs, ready = report["runs"], trained_names(report)
+    with_photos = {name: (name, finished(runs, name)[0]["photos"]) for name in ready if name != REFERENCE}
+    return {name: difference(runs, own, (REFERENCE, PHOTOS)) for name, own in with_photos.items() if REFERENCE in ready}
+
+
+def ablations(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] | None:
+    """Heading and rows: what the global token, four depths, five Gaussians a vertex and each further photo gain."""
+    runs, ready, lines = report["runs"], trained_names(report), []
+    against = {"global token": "no global token", "four depths": "one depth", "1 + 4 Gaussians a vertex": "1 Gaussian a vertex"}
+    for part, other in [*against.items(), ("photos, over the number before", REFERENCE)]:
+        for kind, cameras in ((COUNTS, "standard"), (NEAR, "near")):
+            for score, sign in (("psnr", 1), ("lpips_alex", -1)):
+                cells = []
+                for i, test in enumerate(kind):
+                    base = test if other != REFERENCE else kind[i - 1] if i else None
+                    both = ((REFERENCE, test), (other, base or ""))
+                    known = base and all(name in ready and x in finished(runs, name)[0]["scores"] for name, x in both)
+                    found = difference(runs, *both, score=score) if known else None
+                    cells.append("-" if found is None else found._replace(mean=sign * found.mean).text(2 if sign > 0 else 4))
+                if set(cells) != {"-"}:
+                    lines.append([part, cameras, SCORES[score][0], *cells])
+    return (["", "cameras", "score", *COUNTS], lines) if lines else None

@@ -2,8 +2,8 @@
 
     config = SYSTEMS["lhm"]("bench")
 
-"published" has the sizes of their papers where these are known, "bench" trains on two cores at 128 pixels: the same body,
-tokens, width and losses for all, so that only the system differs. Sizes and sources: the modules of the parts. Each takes the
+"published" has the sizes of their papers where these are known, "bench" trains on two cores at 32 pixels: the same body, width
+and losses for all, so that only the system differs. Sizes and sources: the modules of the parts. Each takes the
 data, the body and the loop of this package, and none of the pretrained networks that some of them have.
 """
 
@@ -23,38 +23,46 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.parts import Driver, Reader
-from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import TransformerConfig
+from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
 Size = Literal["published", "bench"]
 
 BENCH_WIDTH, BENCH_HEAD = 128, 32
 BENCH_TRANSFORMER = TransformerConfig(width=BENCH_WIDTH, layers=4, head_width=BENCH_HEAD)
-BENCH_TOKENS = 336
-"""Token capacity: the person in 4 photos of 128 pixels."""
-
-
-def bench() -> HumanGSConfig:
-    """HumanGS at the size of the bench: the preset `small` with half of its width and photos of 128 pixels."""
-    encoder, reader, decoder = paper_parts(presets.small().architecture)
-    encoder = encoder.clone(texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER)
-    decoder = decoder.clone(hidden=BENCH_WIDTH)
-    conventions = dataclasses.replace(
-        presets.small().conventions,
-        image_size=128,
-        skinning_reach=None,
-        light=False,
-        body_vertices=1500,
-        longest_edge=0.05,
-    )
-    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, Runtime(token_capacity=BENCH_TOKENS))
+BENCH_BLOCKS = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
+BENCH = {"image_size": 32, "body_vertices": 800, "longest_edge": None}
+"""Conventions of the bench; the others are the published ones."""
 
 
 def humangs(size: Size = "published") -> HumanGSConfig:
-    """The paper's network; on the bench the one that we ship, in small."""
-    return presets.paper() if size == "published" else bench()
+    """The paper's network; on the bench narrower and of four layers, for smaller photos of a coarser body, and nothing else."""
+    config = presets.paper()
+    if size == "published":
+        return config
+    encoder, reader, decoder = paper_parts(config.architecture)
+    encoder = encoder.clone(transformer=BENCH_TRANSFORMER, upsampler=UpsamplerConfig(BENCH_WIDTH // 3))
+    parts = Architecture(encoder, reader.clone(output_width=BENCH_WIDTH), decoder.clone(hidden=BENCH_WIDTH))
+    return HumanGSConfig(parts, _scaled(config.conventions))
+
+
+def ours(size: Size = "published") -> HumanGSConfig:
+    """The network that we ship, with our additions: shells, photo colors, Gaussians in the frame of the normals, the person's
+    tokens alone; 1 + 2 Gaussians and no upsampler.
+    """
+    config = presets.small()
+    if size == "published":
+        return config
+    encoder, reader, decoder = paper_parts(config.architecture)
+    encoder = encoder.clone(texture=TriplaneConfig(resolution=32, channels=8), transformer=BENCH_TRANSFORMER)
+    conventions = dataclasses.replace(_scaled(config.conventions), skinning_reach=None, light=False)
+    return HumanGSConfig(Architecture(encoder, reader, decoder.clone(hidden=BENCH_WIDTH)), conventions)
+
+
+def _scaled(conventions: Conventions) -> Conventions:
+    return dataclasses.replace(conventions, **BENCH)
 
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
@@ -62,9 +70,14 @@ def lvsm(size: Size = "published") -> HumanGSConfig:
     parts, conventions = (PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()), Conventions(image_size=256)
     if size == "published":
         return HumanGSConfig(Architecture(*parts, QueryDriver()), conventions, Runtime(dtype="bfloat16"))
-    blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
-    conventions = dataclasses.replace(bench().conventions, tokens="all", pixels="all")
-    return HumanGSConfig(Architecture(*parts, QueryDriver(blocks)), conventions)
+    return HumanGSConfig(Architecture(*parts, QueryDriver(BENCH_BLOCKS)), _scaled(conventions))
+
+
+def lvsm_latents(size: Size = "published") -> HumanGSConfig:
+    """LVSM's encoder-decoder: photos become latents once, and a target attends to these. 12 + 12 layers, 3,072 latents."""
+    config, published = lvsm(size), size == "published"
+    blocks = TransformerConfig(layers=12, class_token=False) if published else dataclasses.replace(BENCH_BLOCKS, layers=2)
+    return config.with_parts(driver=QueryDriver(blocks, latents=3072 if published else 64))
 
 
 def humanram(size: Size = "published") -> HumanGSConfig:
@@ -73,14 +86,13 @@ def humanram(size: Size = "published") -> HumanGSConfig:
     if size == "published":
         driver = QueryDriver(TransformerConfig(layers=12, class_token=False), TriplaneConfig(), fusion=256)
         return config.with_parts(driver=driver).with_conventions(image_size=512)
-    blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
-    return config.with_parts(driver=QueryDriver(blocks, TriplaneConfig(resolution=32, channels=8), fusion=32))
+    return config.with_parts(driver=QueryDriver(BENCH_BLOCKS, TriplaneConfig(resolution=32, channels=8), fusion=32))
 
 
 def giga(size: Size = "published") -> HumanGSConfig:
     """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one Gaussian a texel."""
     driver = TextureDriver() if size == "published" else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
-    surface = SurfaceMap("atlas", 512 if size == "published" else 96)
+    surface = SurfaceMap("atlas", 512 if size == "published" else 48)
     return _on_the_surface(size, TextureReader(surface), surface, driver)
 
 
@@ -103,20 +115,16 @@ def lca(size: Size = "published") -> HumanGSConfig:
 
 def _on_the_surface(size: Size, reader: Reader, surface: SurfaceMap, driver: Driver) -> HumanGSConfig:
     """Systems whose Gaussians are texels: their photos and bodies are those of the others."""
-    conventions = Conventions(pixels="person") if size == "published" else bench().conventions
+    conventions = Conventions(pixels="person")
     parts = Architecture(PlainPhotos(), reader, SurfaceDecoder(surface), driver)
-    return HumanGSConfig(parts, dataclasses.replace(conventions, tokens="all"))
+    return HumanGSConfig(parts, conventions if size == "published" else _scaled(conventions))
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
-    """The paper's reader and decoder without what we added (photo colors, shells, normal frames) and without an upsampler: the
-    partner of `cross_attention`, from which it differs in the reader alone.
-    """
+    """The paper's network without its upsampler: the partner of `cross_attention`, from which it differs in the reader alone."""
     config = humangs(size)
-    encoder, _, decoder = paper_parts(config.architecture)
-    encoder = encoder.clone(upsampler=None)
-    decoder = decoder.clone(frame="canonical", residual_color=False)
-    return config.with_parts(encoder=encoder, reader=PixelAlignedReader(output_width=None), decoder=decoder)
+    encoder, reader, _ = paper_parts(config.architecture)
+    return config.with_parts(encoder=encoder.clone(upsampler=None), reader=reader.clone(output_width=None))
 
 
 def cross_attention(size: Size = "published") -> HumanGSConfig:
@@ -128,20 +136,18 @@ def cross_attention(size: Size = "published") -> HumanGSConfig:
 def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) -> HumanGSConfig:
     """LHM-style (`two_stream`), LHM-500M's sizes: one photo without its camera and pose.
 
-    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1 cm give the default body 58,855 vertices,
-    where theirs has 40,000 points.
+    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1.28 cm give the default body about as many as
+    their 40,000 points.
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
         reader, decoder = (TwoStreamReader(pooling=pooling, most_views=most_views), VertexDecoder(hidden=512))
-        conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.01)
     else:
-        encoder = _photo_encoder(dataclasses.replace(BENCH_TRANSFORMER, class_token=False))
-        reader = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views)
-        decoder, conventions = VertexDecoder(hidden=BENCH_WIDTH), bench().conventions
+        encoder = _photo_encoder(BENCH_BLOCKS)
+        reader, decoder = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views), VertexDecoder(hidden=BENCH_WIDTH)
     decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
-    runtime = Runtime() if size == "published" else bench().runtime
-    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, runtime)
+    conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.0128)
+    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions if size == "published" else _scaled(conventions))
 
 
 def lhm_views(size: Size = "published") -> HumanGSConfig:
@@ -170,13 +176,11 @@ def gst(size: Size = "published") -> HumanGSConfig:
 def ghg(size: Size = "published") -> HumanGSConfig:
     """GHG-style (`shell_textures`): copied colors on five shells; no transformer."""
     published = size == "published"
-    reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 64))
-    # texels of the bench are 3 cm wide on the innermost shell
-    decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.03)
-    conventions = dataclasses.replace(
-        Conventions(pixels="person") if published else bench().conventions, tokens="all", longest_edge=None
-    )
-    return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions)
+    reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 48))
+    # texels of the bench are 4 cm wide on the innermost shell
+    decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.04)
+    conventions = Conventions(pixels="person")
+    return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions if published else _scaled(conventions))
 
 
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
@@ -186,7 +190,9 @@ def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> Patch
 
 SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "humangs": humangs,
+    "ours": ours,
     "lvsm": lvsm,
+    "lvsm_latents": lvsm_latents,
     "humanram": humanram,
     "giga": giga,
     "animatable": animatable,

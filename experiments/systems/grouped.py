@@ -4,9 +4,10 @@ Theirs (Prospero et al. 2024, https://arxiv.org/abs/2409.04196): one photo, a fr
 of 26 groups of 265 vertices of SMPL) that cross-attend to its tokens; a Gaussian a vertex, its mean the posed vertex plus an
 offset; the body's pose and shape and the camera come from the same network.
 
-Our reading: the body is given, as it is to every system here; our patch transformer stands for HMR2's; vertices are grouped in
-their order; offsets are in the canonical frame, so that the person can be posed, which theirs cannot. A token changes nothing
-outside of its group.
+Our reading: the tokens attend to each other before they look at the photo, as in any decoder of a transformer; the body, its pose
+and the camera are given, as they are to every system here, so that nothing is lost by wrong ones; our patch transformer stands
+for HMR2's; vertices are grouped in their order; offsets are in the canonical frame, so that the person can be posed, which theirs
+cannot. Behind the reader a token changes nothing outside of its group.
 """
 
 import flax.linen as nn
@@ -19,7 +20,7 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.configuration import Bias, Layers, Ratio, Spread, Vertices, Width, part
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, subject_unit
-from humangs_jax.network.transformer import layer_norm
+from humangs_jax.network.transformer import INIT_STD, Attention, layer_norm
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -52,7 +53,10 @@ class GroupReader(Reader):
         check_views(inputs, 1)
         tokens, count = image_tokens(encoding, inputs)
         x = self.param("queries", nn.initializers.normal(1.0), (len(ATTRIBUTES) * self.groups, self.width))
+        init = nn.initializers.normal(INIT_STD)
         for index in range(self.layers):
+            own = Attention(self.head_width, True, run.runtime, init, name=f"self_{index}")
+            x = x + own(layer_norm(run.runtime.compute_dtype, f"self_norm_{index}")(x), None)
             x = CrossBlock(self.head_width, self.mlp_ratio, run.runtime, name=f"block_{index}")(x, tokens, count)
         return layer_norm(None, "norm", use_bias=True)(x).reshape(len(ATTRIBUTES), self.groups, self.width)
 

@@ -2,14 +2,16 @@
 
 LVSM, decoder-only (Jin et al. 2024, https://arxiv.org/abs/2410.17242): patches of the photos (rgb and rays, 9 channels) and
 of the target (rays, 6) are tokens with a linear map each; all attend to all; a linear map turns the target's tokens into
-pixels. Trained with squared error and 0.5 VGG-19. It knows no body: it shows other views of the pose in the photos, CANNOT be
-animated, and the pose of a target changes nothing. HumanRAM (Yu et al. 2025, https://arxiv.org/abs/2506.03118) adds a neural
-texture of the body, read at the position maps of photos and of the target (57 and 54 channels): the target's pose enters
+pixels. Trained with squared error and 0.5 VGG-19. Their encoder-decoder: photos and learned latent tokens attend to each other,
+then target and latents (12 + 12 layers, 3,072 latents). LVSM knows no body: it shows other views of the pose in the photos,
+CANNOT be animated, and the pose of a target changes nothing. HumanRAM (Yu et al. 2025, https://arxiv.org/abs/2506.03118) adds a
+neural texture of the body, read at the position maps of photos and of the target (57 and 54 channels): the target's pose enters
 through its position map alone. A residual convolutional decoder fuses its target tokens of four depths. Trained with squared
 error and 1.0 VGG.
 
 Every target is a pass of its own through the whole transformer: photos attend to the target, so nothing of a person can be
-kept from one target to the next, and a frame costs as much as the first one.
+kept from one target to the next, and a frame costs as much as the first one. (The encoder-decoder's latents could be kept; here
+they are made again.)
 
 Our reading: the neural texture and blocks are those of this package. HumanRAM's code is not public: its decoder here adds the
 four depths, from the last to the first, each followed by a residual block, and doubles the sides until a token has its
@@ -24,7 +26,7 @@ import jax.numpy as jnp
 
 from experiments.systems.targets import PixelDriver
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
-from humangs_jax.core.configuration import Patch, Range, part
+from humangs_jax.core.configuration import Patch, Range, Vertices, part
 from humangs_jax.network.encoder import TEXTURE_STD, TriplaneConfig, encoder_pixels, patchify, sample_triplane
 from humangs_jax.network.maps import Convolution
 from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, Target
@@ -74,6 +76,8 @@ class QueryDriver(PixelDriver):
     """Width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map."""
     patch_size: Patch = 8
     """Of photos and targets."""
+    latents: Vertices | None = None
+    """Learned tokens of LVSM's encoder-decoder, which has two transformers, None: photos and target attend to each other."""
 
     def __post_init__(self):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""
@@ -110,6 +114,11 @@ class QueryDriver(PixelDriver):
         # the target comes first: photos that are padding are the last tokens
         real = photos.view_count
         count = None if real is None else targets + real * (len(seen) // len(photos.pixels))
+        if self.latents is not None:
+            learned = self.param("latents", nn.initializers.normal(INIT_STD), (self.latents, width))
+            encoder = Transformer(self.transformer, run.runtime, name="encoder")
+            encoded = encoder(jnp.concatenate([learned, seen]), None if count is None else count - targets + self.latents)[-1]
+            seen, count = encoded[: self.latents], None
         transformer = Transformer(self.transformer, run.runtime, name="transformer")
         depths = transformer(jnp.concatenate([asked, seen]), count)
         rows, columns = query.shape[0] // patch, query.shape[1] // patch

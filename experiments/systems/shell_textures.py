@@ -169,7 +169,7 @@ class ShellDecoder(Decoder):
         offsets = features.distances[:, None, None, None] * safe_normalize(texels.interpolate(normals), jnp.zeros(3))
         channels = jnp.concatenate([2 * features.colors - 1, offsets[1:]])
         entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
-        nn.share_scope(self, network := UNet(self.widths, sum(CHANNELS) * shells))
+        nn.share_scope(self, network := UNet(self.widths, (sum(CHANNELS) * shells,)))
         raw = network(entering)[0]
         raw = jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
         quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)

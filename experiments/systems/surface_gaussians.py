@@ -4,9 +4,9 @@ GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CUR
 x 512 texels, the visible views weighted by the softmax of 5 times the cosine at which they see a texel. Encoders for textures
 and for canonical positions (64 x 1, 2, 4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width
 1024), and decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
-0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: one U-Net of 3 + 1 + 3
-channels (color, whether seen, position) and 14; no static texture of other frames, which half of their steps drop; the pose
-is that of the target.
+0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: encoders of 3 + 1 channels
+(color, whether seen) and 3 (position), whose scales are joined, and three decoders; no static texture of other frames, which half
+of their steps drop, as the photos of a person are all there is; the pose is that of the target.
 
 Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
 back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of
@@ -55,6 +55,8 @@ COVERAGE, THICKNESS = 0.7, 0.2
 """Standard deviations of a Gaussian along the surface over the distance between texels, and across over along it."""
 OPACITY = 0.9
 """Of Gaussians before corrections."""
+NETS = {"offsets": 3, "shapes": 8, "colors": 3}
+"""Outputs of each network or decoder, in the order of `correction.CHANNELS`."""
 
 
 @pytree_dataclass
@@ -148,7 +150,7 @@ def _texels(inputs: HumanGSInputs) -> Texels:
 
 @part
 class TextureDriver(GaussianDriver):
-    """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose."""
+    """GIGA-style: encoders of the texture, seen or not, and of positions; their coarsest maps attend to the pose."""
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
     """Of the U-Net."""
@@ -172,9 +174,10 @@ class TextureDriver(GaussianDriver):
         if surface.texture is None:
             raise ValueError("a TextureDriver needs a TextureReader")
         texture, attention = surface.texture, PoseAttention(self.pose_width, self.pose_tokens, parent=None)
-        maps = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None], surface.positions], axis=-1)
-        nn.share_scope(self, network := UNet(self.widths, CHANNELS, attention))
-        return _driven(outputs, network(maps[None], pose_vector(target.pose, self.joints))[0], self.offset_scale)
+        seen = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None]], axis=-1)
+        nn.share_scope(self, network := UNet(self.widths, tuple(NETS.values()), attention))
+        raw = network(seen[None], surface.positions[None], context=pose_vector(target.pose, self.joints))
+        return _driven(outputs, raw[0], self.offset_scale)
 
 
 @part
@@ -199,8 +202,7 @@ class PoseMapDriver(GaussianDriver):
         middle = jnp.mean(target.vertices, axis=0)
         relative = jnp.matmul(target.vertices - middle, upright, precision=EXACT)  # rows times R: R^T p
         maps = surface.texels.interpolate(relative)[None]
-        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.CHANNELS`
-        raw = jnp.concatenate([UNet(self.widths, n, name=name)(maps) for name, n in nets.items()], axis=-1)
+        raw = jnp.concatenate([UNet(self.widths, (n,), name=name)(maps) for name, n in NETS.items()], axis=-1)
         return _driven(outputs, raw[0], self.offset_scale)
 
 

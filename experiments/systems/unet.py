@@ -29,37 +29,46 @@ class UNet(nn.Module):
     """Maps (v, h, w, c) -> (v, h, w, features).
 
     widths: features at every scale, the finest first; both sides are multiples of 2^(len(widths) - 1), or ValueError. bottleneck:
-    a module that changes the coarsest maps, (v, h', w', widths[-1]) and what the call gives as `context` -> the same shape.
+    a module that changes the coarsest maps, (v, h', w', c') and what the call gives as `context` -> the same shape. Several maps
+    have an encoder each, whose results are joined at every scale; several numbers of features a decoder each, joined at the end.
     """
 
     widths: tuple[int, ...]
-    features: int
+    features: tuple[int, ...]
     bottleneck: nn.Module | None = None
     dtype: Any = None
 
     @nn.compact
-    def __call__(self, x: Float[Array, "v h w c"], context: Any = None) -> Float[Array, "v h w features"]:
-        coarsest = 2 ** (len(self.widths) - 1)
-        if x.shape[1] % coarsest or x.shape[2] % coarsest:
-            raise ValueError(
-                f"maps of {x.shape[2]} x {x.shape[1]}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}"
-            )
+    def __call__(self, *given: Float[Array, "v h w _"], context: Any = None) -> Float[Array, "v h w features"]:
+        coarsest, (_, height, width, _) = 2 ** (len(self.widths) - 1), given[0].shape
+        if height % coarsest or width % coarsest:
+            raise ValueError(f"maps of {width} x {height}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}")
 
         def convolved(x, width, name):
             for i in range(2):
                 x = jax.nn.relu(Convolution(width, KAIMING, self.dtype, name=f"{name}_{i}")(x))
             return x
 
-        kept = []
-        for i, width in enumerate(self.widths):
-            x = convolved(x if i == 0 else halved(x), width, f"down_{i}")
-            kept.append(x)
+        def encoded(x, mark):
+            kept = []
+            for i, width in enumerate(self.widths):
+                x = convolved(x if i == 0 else halved(x), width, f"{mark}down_{i}")
+                kept.append(x)
+            return kept
+
+        def decoded(x, features, mark):
+            for i, skip in reversed(list(enumerate(kept))):
+                x = convolved(jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"{mark}up_{i}")
+            return Convolution(features, nn.initializers.normal(LAST_STD), self.dtype, name=f"{mark}out")(x)
+
+        marks = lambda many: [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
+        scales = zip(*(encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)), strict=True)
+        kept = [jnp.concatenate(maps, axis=-1) for maps in scales]
         x = kept.pop()
         if self.bottleneck is not None:
             x = self.bottleneck(x, context)
-        for i, skip in reversed(list(enumerate(kept))):
-            x = convolved(jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"up_{i}")
-        return Convolution(self.features, nn.initializers.normal(LAST_STD), self.dtype, name="out")(x)
+        outputs = zip(self.features, marks(self.features), strict=True)
+        return jnp.concatenate([decoded(x, features, mark) for features, mark in outputs], axis=-1)
 
 
 def halved(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:

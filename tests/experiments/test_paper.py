@@ -1,126 +1,239 @@
 """The experiments of the paper: variants that belong together, differences within noise, tables."""
 
 import argparse
+import dataclasses
+import itertools
 import json
 
+import jax
 import numpy as np
 import pytest
 
+from experiments import made_up
 from experiments.harness import call
-from experiments.paper import bench, claims, cost, figures, tables, train_all
+from experiments.paper import bench, claims, cost, figures, people, rows, tables, train_all
+from humangs_jax.body.library import load_body
+from humangs_jax.core.configuration import config_to_json
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.preprocess.run import Settings, preprocess
+from humangs_jax.network.config import paper_parts
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.presets import paper
+from humangs_jax.network.weights import save_weights
+from humangs_jax.training.config import tiny
+
+PEOPLE = 20
 
 
-@pytest.fixture(scope="module")
-def queue():
-    return bench.variants(40)
+def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
+    """A row whose test people have these scores, but for what differs between them."""
+    spread = np.random.default_rng(0).normal(0, 2, PEOPLE)  # shared by all runs: people differ more than variants
+    noise = np.random.default_rng(seed + 1).normal(0, 0.05, PEOPLE)
+    values = (psnr + spread + noise).tolist()
+    scores = {"psnr": values, "psnr_fg": values, "ssim": [0.9] * PEOPLE, "lpips_alex": [0.1] * PEOPLE}
+    by_count = {str(count): {"reconstruction": scores, "animation": scores} for count in (photos, *counts)}
+    return {
+        "curve": list(curve), "validation": curve[-1], "done": done, "photos": photos, "steps": 40, "operations": 2e15,
+        "parameters": 1000, "cpu_seconds": 60.0, **({"scores": by_count} if done else {}),
+    }  # fmt: skip
 
 
-def run(psnr, photos=4, **others):
-    scores = {"psnr": psnr + 6, "psnr_fg": psnr, "ssim": 0.9, **others}
-    return {"by_views": {str(photos): scores}, "photos": photos, "parameters": 1_200_000, "steps": 40, "cpu_seconds": 60.4}
+def seeded(psnr, spread=0.1, **others):
+    return {str(seed): run(psnr + spread * step, seed=seed, **others) for seed, step in enumerate((-1, 0, 1))}
 
 
-def test_variants_are_compared_with_variants_and_differ_from_them(queue):
-    for name, variant in queue.items():
-        assert variant.config.steps == 40 and variant.config.target_size == variant.config.model.conventions.image_size
-        if variant.against is not None:
-            against = queue[variant.against]
-            assert variant.config != against.config and variant.claim
-            assert variant.config.views == against.config.views  # the same photos
-            assert against.against is None or against.against == "humangs", name
-    assert list(queue)[:2] == ["back-projection", "cross-attention"]
-    pair = [queue[name].config.model for name in list(queue)[:2]]
-    assert pair[0].with_parts(reader=pair[1].architecture.reader) == pair[1]  # they differ in the reader alone
-    assert len({bench.folder_of(name) for name in queue}) == len(queue)
-    assert bench.view_counts("lhm", queue["lhm"].config) == (1,)
-    assert bench.view_counts("no global token", queue["no global token"].config) == (1, 2, 4, 6)
+@pytest.fixture
+def report():
+    painted = {"reconstruction": run(9.0)["scores"]["4"]["reconstruction"]} | {"animation": run(8.0)["scores"]["4"]["animation"]}
+    runs = {
+        "paper": seeded(15.0, counts=(1, 2, 6, *bench.NEAR)),
+        "ghg": seeded(14.0, counts=(1, 2, 6, *bench.NEAR)),
+        "giga": seeded(16.0),
+        "lhm": {"0": run(12.5, photos=1)},
+        "lvsm": {"0": run(0.0, done=False, curve=(9.0, 9.9))},
+        "humanram": {"0": run(5.0, curve=(5.0, 9.0))},
+    }
+    settings = {"round_steps": 10, "people": 4, "test_people": PEOPLE}
+    return {"settings": settings, "painted": {"validation": 8.0, "test": {"4": painted}}, "runs": runs}
 
 
-def test_differences_inside_the_interval_of_the_seeds_are_noise(queue):
-    rows = {"humangs": run(20.0), "humangs, another seed": run(20.3), "no shells": run(19.8)}
-    # one pair: Student's t with one degree of freedom, 12.706
-    assert bench.seed_interval(rows) == pytest.approx(12.706 * 0.3, rel=1e-3)
-    pairs = rows | {"back-projection": run(19.0), "back-projection, another seed": run(19.4)}
-    assert bench.seed_interval(pairs) == pytest.approx(4.303 * 0.125**0.5, rel=1e-3)
-    assert bench.seed_interval({"humangs": run(20.0)}) is None
-    words = [bench.verdict(difference, 0.3) for difference in (0.2, -0.3, 0.4, -0.4)]
-    assert words == ["within noise", "within noise", "better", "worse"] and bench.verdict(1.0, None) == "noise unknown"
-    rows |= {"pooling over all views": run(15.0), "lhm": run(12.5, photos=1), "humangs, 1 photo": run(18.0, photos=1)}
-    painted = {"1": {"psnr_fg": 8.0}, "4": {"psnr_fg": 9.7}}
-    text = train_all.table(rows, queue, {"validation": ["a", "b"]}, painted)
-    lines = {cells[0].strip(): cells for line in text.splitlines() if (cells := line.strip("| ").split("|"))}
-    assert [lines["no shells"][i].strip() for i in (5, 6, 7)] == ["humangs", "-0.20", "within noise"]
-    said = {"pooling over all views": "worse", "humangs, another seed": "noise", "lhm": "not trained"}
-    assert {name: lines[name][7].strip() for name in said} == said
-    assert "2 unseen people" in text and "+-3.81 dB" in text
-    assert bench.untrained(rows, painted) == ["lhm"]
+def test_the_reference_is_the_papers_network_in_small():
+    small, published = bench.variants()[bench.REFERENCE].model, paper()
+    encoder, reader, decoder = paper_parts(small.architecture)
+    theirs = paper_parts(published.architecture)
+    sizes = {"width": 768, "layers": 12, "head_width": 64}
+    assert encoder.texture == theirs[0].texture and encoder.upsampler.features == "intermediate"
+    assert dataclasses.replace(encoder.transformer, **sizes) == theirs[0].transformer
+    assert (reader.clone(output_width=768), decoder.clone(hidden=256)) == theirs[1:]
+    assert small.with_conventions(image_size=512, body_vertices=None).conventions == published.conventions
+    config = bench.configuration(bench.variants()[bench.REFERENCE], 0, 100, perceptual=True)
+    loss, optimizer = config.loss, config.optimizer
+    assert (loss.squared, loss.vgg16, loss.tightness, loss.structural, loss.silhouette) == (1, 1, 0.1, 0, 0)
+    assert (optimizer.learning_rate, optimizer.weight_decay, config.batch_size) == (4e-4, 0.05, 8)
 
 
-def test_verdicts_of_claims_need_trained_systems_and_intervals_on_one_side():
-    numbers = claims.Numbers()
-    numbers.interval, numbers.gray = {"psnr": 0.1}, ["lhm"]
-    assert numbers.judge(0.2, 0.3) == (claims.CONSISTENT, "")
-    assert numbers.judge(0.2, 0.05) == (claims.NOT_TESTED, "the interval contains 0")
-    assert numbers.judge(0.2, -0.3) == (claims.CONTRADICTED, "")
-    assert numbers.judge(0.2, needs=["lhm", "humangs"]) == (claims.NOT_TESTED, "`lhm` is not trained")
-    assert numbers.judge(-0.2, needs=["lhm"]) == (claims.CONTRADICTED, "`lhm` is not trained")
+def test_variants_differ_from_the_reference_in_what_they_are_about():
+    queue = bench.variants()
+    models = [(variant.model, json.dumps(str(variant.fields))) for variant in queue.values()]
+    assert len(set(models)) == len(models) and len({bench.folder_of(name) for name in queue}) == len(queue)
+    back, cross = queue["back_projection"].model, queue["cross_attention"].model
+    assert back.with_parts(reader=cross.architecture.reader) == cross  # they differ in the reader alone
+    assert all(bench.configuration(x, 0, 8).loss.squared == 1 for x in queue.values())
+    order = train_all.queue(3)
+    assert order[0] == ("paper", 0) and len(set(order)) == len(order) == 3 * len(queue)
+    assert order.index(("paper", 2)) < order.index(("no global token", 0)) < order.index(("lvsm", 1))
+    assert bench.tests_of("lhm", queue["lhm"]) == ("1",) and len(bench.tests_of("ghg", queue["ghg"])) == 8
+
+
+def test_a_run_ends_when_a_round_gains_nothing_and_counts_if_it_beats_the_painted_body():
+    enough = lambda *curve: bench.enough(list(curve), 8.0)
+    assert not enough() and not enough(9.0) and not enough(9.0, 9.5) and not enough(5.0, 5.1)  # below the painted body
+    assert enough(10.0) and enough(9.0, 9.1) and enough(9.0, 9.5, 9.4) and enough(*[1.0] * bench.MOST_ROUNDS)
+    rising = run(1.0, curve=(9.0, 9.9))
+    assert bench.is_trained(rising, 7.9) and not bench.is_trained(rising, 8.0)
+    assert not bench.is_trained(rising | {"done": False}, 1.0)
+    flat = run(1.0, curve=(9.0, 9.1))
+    assert bench.is_trained(flat, 9.0) and not bench.is_trained(flat, 20.0)
+
+
+def test_an_interval_covers_people_and_seeds(report):
+    runs = report["runs"]
+    found = bench.difference(runs, ("paper", 4), ("ghg", 4))
+    assert found.mean == pytest.approx(1.0, abs=0.05) and found.seeds == (3, 3) and found.people == PEOPLE
+    # 3 pairs of groups with a standard deviation of 0.1: 8 degrees or so; people are paired, so that their spread does not count
+    by_hand = 2.4 * 0.1 * (2 / 3) ** 0.5
+    assert found.half == pytest.approx(by_hand, rel=0.15)
+    alone = bench.difference({name: {"0": runs[name]["0"]} for name in runs}, ("paper", 4), ("ghg", 4))
+    assert alone.half is None and str(alone) == f"{alone.mean:+.2f}"
+    assert bench.difference(runs, ("lhm", 1), ("paper", 4)).half > found.half  # one seed of three
+
+
+def test_verdicts_follow_from_intervals_and_need_trained_runs_of_three_seeds(report):
+    pair = lambda a, b, count=4: claims.Pair((a, count), (b, count))
+    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "ghg", 1)]) == (claims.REPRODUCED, "")
+    assert claims.judge(report, [pair("paper", "ghg"), pair("paper", "giga")]) == (claims.CONTRADICTED, "")
+    report["runs"]["ghg"] = seeded(15.0, counts=(1, 2, 6, *bench.NEAR))
+    assert claims.judge(report, [pair("paper", "ghg")]) == (claims.NOT_TESTED, "an interval contains 0")
+    verdict = claims.judge(report, [claims.Pair(("paper", 4), ("lhm", 1)), pair("paper", "lvsm")])
+    assert verdict == (claims.NOT_TESTED, "`lhm` has 1 of 3 seeds, `lvsm` is not trained: 40 steps")
+    assert "not trained: 0 steps" in claims.judge(report, [pair("paper", "gst")])[1]
+    text = claims.said(report, claims.Pair(("paper", 4), ("giga", 4)))
+    assert text.startswith("`paper` 4 - `giga` 4: -1.0") and text.endswith(" dB") and "+-" in text
+
+
+def test_every_claim_is_judged_and_names_variants_that_exist(report):
+    known = {(name, test) for name, x in bench.variants().items() for test in bench.tests_of(name, x)}
+    for claim in claims.claims():
+        assert all({(name, str(test)) for name, test in (pair.a, pair.b)} <= known for pair in claim.pairs), claim.claim
+    rows = claims.judged(report, claims.claims())
+    assert {row[3] for row in rows} == set(claims.VERDICTS)
 
 
 def test_the_page_of_the_paper_says_what_the_results_say():
-    numbers = claims.Numbers()
-    said = {row.claim: row.verdict for row in claims.claims(numbers)}
-    assert set(said.values()) == set(claims.VERDICTS)
-    assert said == bench.results("paper_claims")["verdicts"] and numbers.gray == bench.results("paper_claims")["untrained"]
+    report, cost_numbers = bench.results("paper"), bench.results("paper_cost")
+    rows = claims.judged(report, [*claims.claims(), *claims.of_cost(cost_numbers)])
+    assert {row[0]: row[3] for row in rows} == bench.results("paper_claims")["verdicts"]
     page = bench.PAGE.read_text()
-    assert page.index(claims.CONTRADICTED, page.index("| holds? |")) < page.index(claims.CONSISTENT, page.index("| holds? |"))
-    assert not any(line.rstrip(" |").endswith("yes") for line in page.splitlines() if line.startswith("|"))
+    verdicts = [line.split("|")[4].split(":")[0].strip() for line in page.splitlines() if line.count("|") == 5]
+    places = [claims.VERDICTS.index(verdict) for verdict in verdicts if verdict in claims.VERDICTS]
+    assert places == sorted(places) and len(places) == len(rows)  # contradictions first
+
+
+def test_the_table_marks_what_is_not_trained(report):
+    first = train_all.table(report).split("\n\n")[0]
+    lines = {cells[0].strip(): cells for line in first.splitlines() if (cells := line.strip("| ").split("|"))}
+    assert "not trained: 40 steps, 9.90 dB in validation" in lines["lvsm"][8] and lines["lvsm"][3].strip() == "-"
+    assert "not trained" in lines["humanram"][8]  # done, but hardly better than the painted body and still rising
+    assert lines["giga"][8].strip().startswith("+1.0") and [lines["ghg"][i].strip() for i in (1, 2)] == ["4", "3"]
+    assert bench.trained_names(report) == ["paper", "ghg", "giga", "lhm"]
+    report["runs"]["no global token"] = seeded(14.5, counts=(1, 2, 6))
+    text = train_all.table(report)
+    assert (
+        "| global token | standard | PSNR, dB | +0.5" in text
+        and "| photos, over the number before | near | PSNR, dB | - | +0.0" in text
+    )
 
 
 def test_runs_of_other_settings_are_not_mixed(tmp_path):
     path = tmp_path / "results.json"
-    assert train_all.kept(path, {"steps": 1}) == {}
-    path.write_text('{"settings": {"steps": 2}, "runs": {}}')
+    assert train_all.kept(path, {"people": 1})["runs"] == {}
+    path.write_text('{"settings": {"people": 2}, "runs": {}}')
     with pytest.raises(ValueError, match="other settings"):
-        train_all.kept(path, {"steps": 1})
+        train_all.kept(path, {"people": 1})
+
+
+@pytest.mark.slow
+def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
+    folder = people.write_plain(tmp_path / "p", "demo", 1, 6, size=64)
+    near = people.write_plain(tmp_path / "near", "demo", 1, 6, 4, near=True)
+    capture, close = (load_capture(next(x.glob("3*"))) for x in (folder, near))
+    assert capture.images.shape == (12, 64, 64, 3) and close.images.shape == (6, people.SIZE, people.SIZE, 3)
+    assert close.masks.mean() > 1.3 * capture.masks.mean()
+    assert load_capture(next(near.glob("3*")) / "held_out").frame_count == 2
+    body = load_body()
+    assert people.plain(3_000_000, body).lights == people.plain(3_000_001, body).lights
+    config = bench.configuration(bench.variants()["lvsm"], 0, 4)
+    make = lambda **how: people.on_disk(folder, **how)(config)
+    both, one = make(), make(one_pose=True)
+    targets = lambda source: {
+        x.targets.rotations.tobytes() != x.inputs.rotations[:1].tobytes() for i in range(12) for x in [source.example(0, i, 4)]
+    }
+    assert targets(one) == {False} and targets(both) == {False, True}
+    colored = make(recolored=True)
+    plain, changed = both.example(0, 3, 4), colored.example(0, 3, 4)
+    orders = itertools.permutations(range(3))
+    assert any(np.array_equal(plain.inputs.images[..., list(order)], changed.inputs.images) for order in orders)
+    assert len({colored.example(0, i, 4).inputs.images.tobytes() for i in range(6)}) > 1
+
+
+@pytest.mark.slow
+def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "MOST_ROUNDS", 2)
+    out = tmp_path / "runs"
+    assert call(train_all.paper, [str(out), "--quick", "--only", "ghg"]) == 0
+    report = json.loads((out / "results.json").read_text())
+    row = report["runs"]["ghg"]["0"]
+    assert row["done"] and row["steps"] == 4 * len(row["curve"]) + 1 and row["operations"] > 0
+    assert len(row["scores"]["4"]["animation"]["lpips_alex"]) == 2
+    before = (out / "results.json").stat().st_mtime_ns
+    assert call(train_all.paper, [str(out), "--quick", "--only", "ghg"]) == 0  # nothing is left to do
+    assert (out / "results.json").stat().st_mtime_ns == before
+
+
+def measured_as(names, psnr=20.0):
+    asked = []
+
+    def measure(name, people, photos, varying=False):
+        asked.append((name, people, photos, varying))
+        scores = {"psnr": psnr + photos + len(people.name if people else ""), "ssim": 0.9, "lpips_vgg": None}
+        found = {"photos": photos, "reconstruction": scores, "animation": scores, "model_s": 0.5, "frame_s": 0.01}
+        return found if people and name in names else None
+
+    return measure, asked
 
 
 def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
-    asked = []
-
-    def measure(name, people, photos):
-        asked.append((name, people, photos))
-        scores = {"psnr": 20.0 + photos, "ssim": 0.9, "lpips_vgg": None}
-        found = {"photos": photos, "reconstruction": scores, "animation": scores, "model_s": 0.5, "frame_s": 0.01}
-        return found if people and name == "humangs" else None
-
-    arguments = argparse.Namespace(people=tmp_path, other=[], near=None, split=None, fits=tmp_path / "fits.json")
-    arguments.gray = []
+    measure, asked = measured_as(["mine"])
+    data, other, third = (tmp_path / name for name in ("p", "walking", "hats"))
+    options = tables.Compared(data=data, other=(other, third), times=True, fits=tmp_path / "fits.json")
     fit = {"animation": {"psnr": 21.0, "ssim": 0.9, "lpips_vgg": None}, "fit_s": 300.0, "frame_s": 0.5}
-    arguments.fits.write_text(json.dumps({"numbers": {"paper_fits": {"a": fit, "b": fit}}}))
-    texts = {name: table(["humangs", "lhm"], measure, arguments) for name, table in tables.TABLES.items()}
-    assert "| humangs | 4 photos | 24.00 / 0.900 / - |  |  |" in texts["animation"]
+    options.fits.write_text(json.dumps({"numbers": {"paper_fits": {"a": fit, "b": fit}}}))
+    texts = {name: table(["mine", "lhm"], measure, options) for name, table in tables.TABLES.items()}
+    assert "| mine | 4 photos | 25.00 / 0.900 / - | 0.50 | 0.010 |" in texts["animation"]
+    assert ("mine", data, 4, True) in asked and ("mine", data, 4, False) in asked  # table 1 shows varying poses
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
     others, alone = texts["animation"].split("\n\n")
     assert "animatable" not in others and "| animatable | fitted to each of 2 other people | 21.00 / 0.900 / - |" in alone
-    assert "| humangs | standard | 21.00 / 0.900 / - |" in texts["views"]
+    assert "| mine | standard | 22.00 / 0.900 / - |" in texts["views"]
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
-    assert "| humangs | 4 photos | 24.00 / 0.900 / - | - |" in texts["domains"]
-    assert "| humangs | 4 photos |" in texts["gaussians"] and ("lhm", tmp_path, 4) in asked
+    assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["domains"]
+    assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["gaussians"]
 
 
-def test_other_kinds_of_people_are_columns_and_another_split_a_row(tmp_path):
-    def measure(name, people, photos):
-        scores = {"psnr": 20.0 + len(people.name), "ssim": 0.9, "lpips_vgg": None}
-        return {"photos": photos, "reconstruction": scores}
-
-    people, other, third, unseen = (tmp_path / name for name in ("p", "walking", "hats", "unseen"))
-    arguments = argparse.Namespace(people=people, other=[other, third], split=[tmp_path, unseen], gray=["lhm"])
-    assert "| lhm | 4 photos, not trained | 21.00" in tables.domains(["lhm"], measure, arguments)
-    text = tables.domains(["humangs"], measure, arguments)
-    assert "in domain | cross-domain: walking | cross-domain: hats |" in text
-    assert "| humangs | 4 photos | 21.00 / 0.900 / - | 27.00 / 0.900 / - | 24.00 / 0.900 / - |" in text
-    assert "| humangs, on the other split | 4 photos | 26.00 / 0.900 / - | - | - |" in text
-    assert "| HumanGS | paper | 30.81 / 0.980 / 0.024 | 27.27 / 0.970 / 0.033 |  |" in text
+def test_another_split_is_a_row_of_its_own(tmp_path):
+    measure, _ = measured_as(["mine, on the other split"])
+    options = tables.Compared(data=tmp_path / "p", split=(str(tmp_path / "unseen"), "mine=weights"))
+    assert "| mine, on the other split | 4 photos | 30.00 / 0.900 / - | - |" in tables.domains([], measure, options)
 
 
 def test_a_cost_table_has_the_ratio_of_the_readers():
@@ -166,12 +279,59 @@ def test_patches_are_those_that_the_person_fills():
     assert figures.patch_error(truth, truth + 0.5, found[0]) == pytest.approx(0.25)
 
 
-def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are(tmp_path, monkeypatch):
-    frames = argparse.Namespace(frames=np.repeat([0, 1, 2], 4))
-    monkeypatch.setattr(figures, "find_captures", lambda folder: [folder / "person"])
-    monkeypatch.setattr(figures, "load_capture", lambda folder: frames)
-    chosen = figures.varied(tmp_path, 4)["person"]
-    assert frames.frames[chosen["context"]].tolist() == [0, 1, 0, 1] and len(set(chosen["context"])) == 4
-    assert frames.frames[chosen["target"]].tolist() == [2] * 4  # an novel pose
-    (tmp_path / "person" / "held_out").mkdir(parents=True)
-    assert figures.varied(tmp_path, 4) is None
+def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are():
+    frames = np.repeat(np.arange(12), 4)
+    context, target = rows.varied(frames, 4)
+    assert frames[context].tolist() == [0, 3, 6, 9] and [i % 4 for i in context] == [0, 1, 2, 3]
+    assert not set(frames[context]) & set(frames[target]) and len(target) == 32
+    few = np.repeat([0, 1, 2], 4)  # the last pose is new
+    context, target = rows.varied(few, 4)
+    assert few[context].tolist() == [0, 1, 0, 1] and len(set(context)) == 4 and few[target].tolist() == [2] * 4
+    assert rows.varied(np.zeros(8, int), 4) == ([], [])
+
+
+def test_people_with_many_targets_come_in_parts(monkeypatch):
+    def find(people, photos, chosen, body):
+        load = lambda i: (("a", "b", "c")[i], list(chosen[("a", "b", "c")[i]]["target"]))
+        return argparse.Namespace(names=("a", "b", "c"), load=load)
+
+    monkeypatch.setattr(rows, "find_people", find)
+    views = {name: {"context": [0], "target": list(range(1, 1 + count))} for name, count in (("a", 450), ("c", 10))}
+    found = list(rows.cases("somewhere", 4, None, views))
+    assert [(name, len(target)) for name, target in found] == [("a", 200), ("a", 200), ("a", 50), ("c", 10)]
+    assert [x for name, target in found if name == "a" for x in target] == views["a"]["target"]
+
+
+LAYOUTS = {
+    "thuman": {"seeds": made_up.SEEDS[:1], "texture_size": 256},
+    "avatarrex": {"frames": 5, "cameras": 4, "size": (90, 120)},
+    "thuman4": {"frames": 5, "cameras": 4, "size": (96, 84)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_tables_run_on_the_layouts_of_real_data(layout, tmp_path, capsys):
+    """One command trains a network, and measures it and other weights: with fixed views, and with inputs of several poses."""
+    data, body = made_up.WRITERS[layout](tmp_path / "raw", **LAYOUTS[layout]), tmp_path / "raw" / "body.npz"
+    if layout == "thuman":
+        settings = Settings("thuman", size=64, views=10, supersample=1, train=1, test=0)
+        preprocess(data, data := tmp_path / "scenes", str(body), settings, progress=False)
+    config, files = tiny(), [tmp_path / name for name in ("config.json", "other.safetensors", "out.json")]
+    (config_file, other, out) = files
+    config_file.write_text(config_to_json(dataclasses.replace(config, steps=2)))
+    save_weights(other, init_humangs(jax.random.key(0), config.model), config.model)
+    options = ["--data", str(data), "--body", str(body), "--weights", f"other={other}", "--near", str(data), "--other", str(data)]
+    options += ["--train", str(tmp_path / "mine"), "--train-on", str(data), "--config", str(config_file), "--json", str(out)]
+    assert call(tables.tables, options) == 0
+    text = capsys.readouterr().out
+    numbers = json.loads(out.read_text())["numbers"]["tables"]["rows"]
+    assert all(f"| {name} | 4 photos |" in text for name in ("mine", "other")) and text.count("**") == 2 * len(tables.TABLES)
+    moved = numbers[f"mine, {data.name}, 4, varying poses"]["animation"]
+    assert (moved is None) == (layout == "thuman")  # of one pose
+    assert 0 < numbers[f"mine, {data.name}, 2"]["reconstruction"][0] < 60
+    name = next(iter(rows.views_of(data, 4, body, False)))
+    chosen = tmp_path / "indices.json"
+    chosen.write_text(json.dumps({name: {"context": [0, 1, 2, 3], "target": [4, 5]}}))
+    fixed = [*options[:6], "--indices", str(chosen), "--only", "reconstruction"]
+    assert call(tables.tables, fixed) == 0 and "| other | 4 photos |" in capsys.readouterr().out

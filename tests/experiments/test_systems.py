@@ -217,7 +217,7 @@ def test_shells_and_maps_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="expected ascending distances, the first 0"):
         ShellTextureReader(shells=(0.01, 0.02))
     with pytest.raises(ValueError, match=r"maps of 6 x 6: a U-Net of 3 scales needs multiples of 4"):
-        jax.eval_shape(lambda: UNet((2, 2, 2), 1).init(jax.random.key(0), jnp.zeros((1, 6, 6, 1))))
+        jax.eval_shape(lambda: UNet((2, 2, 2), (1,)).init(jax.random.key(0), jnp.zeros((1, 6, 6, 1))))
     inputs, config = photos("ghg"), small_system("ghg")
     with pytest.raises(ValueError, match="shell textures need texels"):
         read({}, encode({}, inputs, config), replace(inputs, texels=None), config)

@@ -197,7 +197,7 @@ def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     assert np.abs(frame.gaussians.means - outputs.gaussians.means).max() < small(name).architecture.driver.offset_scale + 1e-6
     fresh = random_variables(small(name))
     zeros = jax.tree_util.tree_map_with_path(
-        lambda path, x: 0 * x if any(entry.key == "out" for entry in path) else x, fresh["params"]["driver"]
+        lambda path, x: 0 * x if any(entry.key.endswith("out") for entry in path) else x, fresh["params"]["driver"]
     )
     fresh["params"]["driver"] = zeros
     frame, outputs = driven(name, variables=fresh)

@@ -1,0 +1,147 @@
+"""Plain people, whom small networks learn to read on two cores: one cut of clothes in plain dyes, one light, eight poses.
+
+Bodies, skin, dyes and cameras differ. Each person is seen in two of the poses.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.progress import bar
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import save_capture
+from humangs_jax.data.loading import CaptureSource, Example, PeopleCache, StoredSubject, find_captures
+from humangs_jax.data.loading.captures import CaptureFolder
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.people.cameras import cameras_around, spread_azimuths
+from humangs_jax.people.fabrics import Fabric, random_color
+from humangs_jax.people.outfits import Garment
+from humangs_jax.people.poses import sample_rotations
+from humangs_jax.people.shading import sample_lights
+from humangs_jax.people.subject import Person, PosedSubject, describe, make_subject, seeds_of
+from humangs_jax.people.writer import HELD_OUT, View, capture_views, stand
+from humangs_jax.training.sources import MakeSource, cached_people
+
+SIZE, POSES = 32, 8
+"""Pixels a side; poses that all people share."""
+CLOTHES_STREAM, POSE_STREAM, CAMERA_STREAM, COLOR_STREAM = 30, 31, 32, 33
+LIGHT_SEED = 5
+NEARER = 0.6
+"""Distance of the cameras of near people over that of the others: parts of the person leave the frame."""
+CLOTHES = {
+    "longsleeve": ({"sleeve": 0.6, "bottom": -0.33, "loose": 0.4, "depth": 0.05}, {"crew"}),
+    "chinos": ({"top": -0.26, "end": -1.16, "width": 0.01, "loose": 0.4, "waist": -0.22, "tucked": 0.0}, set()),
+    "flats": ({"height": 0.07, "sole": 0.015, "over": 0.0}, set()),
+}
+"""Sizes and details of the garments, see `people.outfits`."""
+
+
+def plain(seed: int, body: BodyModel) -> Person:
+    """The person of a seed in plain clothes, with short hair, in the one light."""
+    rng, person = np.random.default_rng([seed, CLOTHES_STREAM]), describe(seed, body)
+    garments = []
+    for kind, (sizes, details) in CLOTHES.items():
+        color = random_color(rng)
+        garments.append(Garment(kind, Fabric("plain", color, color, int(rng.integers(1 << 31))), sizes, frozenset(details)))
+    haircut = dataclasses.replace(person.haircut, cut="buzz", beard="none")
+    lights = sample_lights(np.random.default_rng(LIGHT_SEED))
+    return dataclasses.replace(person, garments=tuple(garments), haircut=haircut, lights=lights)
+
+
+def write_plain(out: Path, split: str, count: int, views: int, held_out: int = 0, size: int = SIZE, near: bool = False) -> Path:
+    """People of a split as captures of two poses, `views` photos of each; folders that are there are kept. Returns `out`.
+
+    held_out: where it is not 0 the capture has the first pose alone, and held_out/ has that many views of either.
+    """
+    body = load_body()
+    for seed in bar(seeds_of(split, 0, count), desc=out.name, unit="person"):
+        folder = out / f"{seed:07d}"
+        if (folder / "capture.json").is_file():
+            continue
+        subject, rng = make_subject(seed, body, plain(seed, body)), np.random.default_rng([seed, CAMERA_STREAM])
+        chosen = rng.choice(POSES, 2, replace=False)
+        generators = [np.random.default_rng([POSE_STREAM, int(pose)]) for pose in chosen]
+        posed = [stand(subject, sample_rotations(generator, subject.build)) for generator in generators]
+        seen = _views(rng, posed[:1] if held_out else posed, views, size, near)
+        unseen = _views(rng, posed, held_out, size, near)
+
+        def write(temporary: Path, subject=subject, posed=posed, seen=seen, unseen=unseen) -> None:
+            save_capture(temporary, capture_views(subject, body, posed[: 1 + (not unseen)], seen))
+            if unseen:
+                save_capture(temporary / HELD_OUT, capture_views(subject, body, posed, unseen))
+
+        replace_folder(folder, write, mark="capture.json")
+    return out
+
+
+def _views(rng: np.random.Generator, posed: list[PosedSubject], count: int, size: int, near: bool) -> list[View]:
+    views = []
+    for frame, one in enumerate(posed if count else ()):
+        cameras = cameras_around(rng, one.vertices, spread_azimuths(rng, count), size)
+        if near:
+            middle = 0.5 * (one.vertices.min(0) + one.vertices.max(0))
+            cameras = _closer(cameras, middle)
+        views += [View(frame, f"{frame}_{i:02d}", cameras[i]) for i in range(count)]
+    return views
+
+
+def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
+    """Cameras moved towards a point of the world."""
+    pose = np.array(cameras.cam_from_world)
+    at = pose[:, :3, :3] @ middle + pose[:, :3, 3]
+    pose[:, :3, 3] -= (1 - NEARER) * at
+    return replace(cameras, cam_from_world=pose)
+
+
+class OnePose(CaptureFolder):
+    """A capture of which only the views of the first pose are used, for systems that show no other."""
+
+    def summary(self) -> StoredSubject:
+        """See `StoredPerson`."""
+        found = super().summary()
+        first = found.frames == found.frames[0]
+        return found._replace(**{name: getattr(found, name)[first] for name in ("K", "cam_from_world", "frames", "azimuths")})
+
+
+@dataclasses.dataclass(frozen=True)
+class Recolored:
+    """A `Source` whose examples have their color channels exchanged, the same way in all images of one: six times the dyes."""
+
+    source: CaptureSource
+
+    @property
+    def input_counts(self) -> tuple[int, ...]:
+        """See `Source`."""
+        return self.source.input_counts
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """See `Source`."""
+        return self.source.broken
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """See `Source`."""
+        order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
+        found = self.source.example(seed, index, input_count)
+        change = lambda views: replace(views, images=views.images[..., order])
+        return replace(found, inputs=change(found.inputs), targets=change(found.targets))
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        return self.source.describe(seed, index, input_count)
+
+
+def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> MakeSource:
+    """The people of a folder as a run's source. one_pose: of the first pose alone."""
+    body, kind = load_body(), OnePose if one_pose else CaptureFolder
+    make = cached_people(PeopleCache([kind(path, body) for path in find_captures(folder)]))
+    return (lambda config: Recolored(cast(CaptureSource, make(config)))) if recolored else make
