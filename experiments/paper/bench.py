@@ -166,7 +166,7 @@ def train_run(
     the vertex colors reach.
     """
     curve, body, networks = row.get("curve", []), load_body(), load_loss_networks(installed=True)
-    number = len(curve) + (perceptual := enough(curve, painted))
+    number, perceptual = len(curve), enough(curve, painted)
     if networks.vgg16 is None:
         raise ValueError("the perceptual loss needs VGG-16: pip install humangs_jax[lpips]")
     networks = networks if perceptual else LossNetworks()

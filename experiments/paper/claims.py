@@ -69,8 +69,7 @@ def paper_claims(run: Run) -> None:
     lines = [[*row[:3], f"{row[3]}: {row[4]}" if row[4] else row[3]] for row in rows]
     heads = ["claim", "what the paper says", "what we measured", "verdict"]
     texts = [markdown_table(heads, lines, "llll")]
-    ours = {name: variant for name, variant in variants().items() if variant.about == "ours"}
-    added = [[name, said(report, Pair((name, PHOTOS), (REFERENCE, PHOTOS), score="psnr_fg"))] for name in ours]
+    added = [[name, said(report, x) or lacking(report, [x], 1)] for name, x in additions().items()]
     texts += ["Our own additions, each alone added to the paper's network:", markdown_table(["", "foreground PSNR"], added, "ll")]
     run.show("\n\n".join(texts), {"verdicts": {row[0]: row[3] for row in rows}})
 
@@ -78,19 +77,18 @@ def paper_claims(run: Run) -> None:
 def judged(report: Mapping[str, Any], listed: Iterable[Claim]) -> list[tuple[str, str, str, str, str]]:
     """Rows: claim, the paper, ours, verdict, why."""
     return [
-        (row.claim, row.paper, "; ".join(said(report, pair) for pair in row.pairs), *judge(report, row.pairs))
+        (row.claim, row.paper, "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-", *judge(report, row.pairs))
         if row.pairs
-        else (row.claim, row.paper, row.measured, *row.verdict)
+        else (row.claim, row.paper, row.measured or "-", *row.verdict)
         for row in listed
     ]
 
 
 def said(report: Mapping[str, Any], pair: Pair) -> str:
-    """A difference in words; how far its runs are where there is none."""
-    names = " - ".join(f"`{name}` {count}" for name, count in pair[:2])
-    short = lacking(report, pair, 1)
+    """A difference in words; nothing where a run is not trained."""
+    names = " - ".join(f"`{name}` {test}" for name, test in pair[:2])
     unit, digits = ("", 4) if pair.score.startswith("lpips") else (" dB", 2)
-    return short or f"{names}: {measured(report, pair).text(digits)}{unit}"
+    return "" if lacking(report, [pair], 1) else f"{names}: {measured(report, pair).text(digits)}{unit}"
 
 
 def measured(report: Mapping[str, Any], pair: Pair) -> Difference:
@@ -99,27 +97,32 @@ def measured(report: Mapping[str, Any], pair: Pair) -> Difference:
     return found._replace(mean=-found.mean) if pair.score.startswith("lpips") else found
 
 
-def lacking(report: Mapping[str, Any], pair: Pair, seeds: int) -> str:
+def lacking(report: Mapping[str, Any], pairs: Iterable[Pair], seeds: int) -> str:
     """What is missing for a verdict that needs so many seeds; "": nothing."""
     ready, texts = trained_names(report), []
-    for name, _ in pair[:2]:
-        runs = report["runs"].get(name, {}).values()
+    for name in dict.fromkeys(name for pair in pairs for name, _ in pair[:2]):
+        steps = max((x["steps"] for x in report["runs"].get(name, {}).values()), default=0)
         if name not in ready:
-            texts.append(f"`{name}` is {NOT_TRAINED}: {max((x['steps'] for x in runs), default=0)} steps")
-        elif len(finished(report["runs"], name)) < seeds:
-            texts.append(f"`{name}` has {len(finished(report['runs'], name))} of {seeds} seeds")
+            texts.append(f"`{name}` is {NOT_TRAINED}: {steps} steps")
+        elif (count := len(finished(report["runs"], name))) < seeds:
+            texts.append(f"`{name}` has {count} of {seeds} seeds")
     return ", ".join(texts)
 
 
 def judge(report: Mapping[str, Any], pairs: Iterable[Pair]) -> tuple[str, str]:
     """(verdict, why) of differences that the paper has above 0."""
-    missing = dict.fromkeys(text for pair in pairs if (text := lacking(report, pair, SEEDS)))
-    if missing:
-        return NOT_TESTED, ", ".join(missing)
-    found = [(x.mean, x.half) for pair in pairs if (x := measured(report, pair)).half is not None]
+    if missing := lacking(report, pairs, SEEDS):
+        return NOT_TESTED, missing
+    found = [(x.mean, x.half or 0.0) for x in (measured(report, pair) for pair in pairs)]
     if any(mean + half < 0 for mean, half in found):
         return CONTRADICTED, ""
     return (REPRODUCED, "") if all(mean > half for mean, half in found) else (NOT_TESTED, "an interval contains 0")
+
+
+def additions() -> dict[str, Pair]:
+    """What is ours and not the paper's, by name."""
+    names = [name for name, variant in variants().items() if variant.about == "ours"]
+    return {name: Pair((name, PHOTOS), (REFERENCE, PHOTOS), score="psnr_fg") for name in names}
 
 
 def claims() -> list[Claim]:
