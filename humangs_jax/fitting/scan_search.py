@@ -20,6 +20,7 @@ from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.keypoints.sets import mirrored_name
 from humangs_jax.fitting.landmark_fit import cube_rotations
 from humangs_jax.fitting.residuals.keypoints import trunk_weights
 from humangs_jax.fitting.residuals.scan import (
@@ -268,7 +269,7 @@ def facing_back(
     the start's frame.
     """
     model, prior = surface.landmarks, pose_prior(surface.landmarks.joint_names)
-    swapped = rotations[[model.joint_names.index(_other_side(name)) for name in model.joint_names]] * HALF_TURN
+    swapped = rotations[[model.joint_names.index(mirrored_name(name)) for name in model.joint_names]] * HALF_TURN
     swapped = np.clip(swapped, prior.lower, prior.upper)
     swapped[0] = 0
     root = np.asarray(quaternion.matrix_from_axis_angle(jnp.asarray(rotations[0], jnp.float32)), np.float64)
@@ -276,11 +277,6 @@ def facing_back(
     there = np.asarray(model.joints[0], np.float64)
     move = Similarity(1.0, turn, there - turn @ pelvis)
     return Start(move.after(Similarity(size, np.eye(3), np.zeros(3))).after(start.align), swapped, start.cost)
-
-
-def _other_side(name: str) -> str:
-    side, _, part = name.partition("_")
-    return {"left": f"right_{part}", "right": f"left_{part}"}.get(side, name)
 
 
 def search(
