@@ -43,14 +43,14 @@ LEFT_OUT = {
 SMALLER = {
     "docs/data.md": {
         "range(200)": "range(2)",
-        "texture_size=512, processes=8": "texture_size=64, processes=1",
+        "texture_size=512, processes=8": "texture_size=256, processes=1",
         "input_counts=(1, 2, 4, 6), target_count=3": "input_counts=(2,), target_count=1",
         "input_size=256, target_size=256": "input_size=32, target_size=32",
         "batch_size=8": "batch_size=4",
         "OnTheFlyConfig())": "OnTheFlyConfig(input_size=32, target_size=32))",
     },
-    "docs/export.md": {"texture_size=2048": "texture_size=64"},
     "docs/refinement.md": {"seconds=15.0": "seconds=1.0"},
+    "docs/tradeoff.md": {"frame_ms=33": "frame_ms=60_000"},
     "docs/video.md": {"width=540, height=720": "width=54, height=72"},
 }
 """What of a page is exchanged: the same at a size for tests."""
@@ -149,7 +149,7 @@ def test_the_blocks_of_a_page_on_a_person_run(page, person, files):
         from humangs_jax.people.writer import Layout, write_set
 
         write_set(files / "people", 2, Layout(128, views=4), "train", 0, workers=1)
-        person = person | {"bank": build_bank(range(2), person["body"], "train", texture_size=64, processes=1)}
+        person = person | {"bank": build_bank(range(2), person["body"], "train", texture_size=256, processes=1)}
     if page == "docs/evaluation.md":
         shutil.copyfile(ROOT / "humangs_jax/assets/weights.safetensors", files / "weights.safetensors")
         for name, capture in (("me", "demo_capture"), ("me/held_out", "demo_capture/held_out")):

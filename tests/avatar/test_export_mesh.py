@@ -201,6 +201,12 @@ def test_numbers_of_turns_never_jump_between_frames(tmp_path):
         assert np.abs(np.diff(quats, axis=0)).max() < 0.3  # a twelfth of a turn
 
 
+@pytest.mark.parametrize("size", [64, 1000])
+def test_a_texture_of_another_size_is_refused(size):
+    with pytest.raises(ValueError, match=f"texture of {size} texels a side: expected a multiple of 128"):
+        mesh_export.body_mesh(avatar(), size)
+
+
 @pytest.mark.slow
 def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     one = avatar()

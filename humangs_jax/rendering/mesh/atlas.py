@@ -60,7 +60,11 @@ def unwrap(vertices: Points, faces: Faces, pieces: Int[np.ndarray, " f"], size: 
     """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
 
     density: texels per metre of each face relative to others; the same all over a piece.
+
+    Raises: ValueError for a size that is no multiple of `CELLS`.
     """
+    if size < CELLS or size % CELLS:
+        raise ValueError(f"texture of {size} texels a side: expected a multiple of {CELLS}")
     corners = vertices[faces]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     pairs = _adjacent(faces)
