@@ -304,6 +304,13 @@ def is_trained(row: Mapping[str, Any], painted: float) -> bool:
     return row["done"] and meets(row["curve"], painted)
 
 
+def state_of(report: Mapping[str, Any], name: str) -> str:
+    """Of a variant that has no trained run with scores."""
+    rows, painted = list(report["runs"].get(name, {}).values()), report["painted"]["validation"]
+    how = "trained, not scored" if any(is_trained(row, painted) for row in rows) else NOT_TRAINED
+    return f"{how}: {max((row['steps'] for row in rows), default=0)} steps"
+
+
 def trained_names(report: Mapping[str, Any]) -> list[str]:
     """Variants of which a run meets it and has scores."""
     painted = report["painted"]["validation"]

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from experiments.harness import Run, entry
 from experiments.paper.bench import (
     NEAR,
-    NOT_TRAINED,
     PHOTOS,
     REFERENCE,
     SEEDS,
@@ -15,6 +14,7 @@ from experiments.paper.bench import (
     difference,
     finished,
     results,
+    state_of,
     trained_names,
     variants,
 )
@@ -101,9 +101,8 @@ def lacking(report: Mapping[str, Any], pairs: Iterable[Pair], seeds: int) -> str
     """What is missing for a verdict that needs so many seeds; "": nothing."""
     ready, texts = trained_names(report), []
     for name in dict.fromkeys(name for pair in pairs for name, _ in pair[:2]):
-        steps = max((x["steps"] for x in report["runs"].get(name, {}).values()), default=0)
         if name not in ready:
-            texts.append(f"`{name}` is {NOT_TRAINED}: {steps} steps")
+            texts.append(f"`{name}` is {state_of(report, name)}")
         elif (count := len(finished(report["runs"], name))) < seeds:
             texts.append(f"`{name}` has {count} of {seeds} seeds")
     return ", ".join(texts)

@@ -33,6 +33,7 @@ from experiments.paper.bench import (
     last_weights,
     network,
     painted,
+    state_of,
     tested,
     tests_of,
     train_run,
@@ -163,7 +164,7 @@ def table(report: Mapping[str, Any]) -> str:
         compute = [f"{sum(x[key] for x in own.values()) / unit:.2g}" for key, unit in spent.items()]
         last = next(iter(own.values()))
         if not rows or not is_trained(rows[0], least):
-            said = f"{NOT_TRAINED}: {steps} steps, {last['validation']:.2f} dB in validation"
+            said = f"{state_of(report, name)}, {last['validation']:.2f} dB in validation"
             lines.append([name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute])
             continue
         means = {key: np.mean([headline(x)["reconstruction"][key] for x in rows]) for key in SCORES}
