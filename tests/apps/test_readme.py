@@ -50,7 +50,7 @@ SMALLER = {
         "OnTheFlyConfig())": "OnTheFlyConfig(input_size=32, target_size=32))",
     },
     "docs/refinement.md": {"seconds=15.0": "seconds=1.0"},
-    "docs/tradeoff.md": {"frame_ms=33": "frame_ms=60_000"},
+    "docs/tradeoff.md": {"frame_ms=33.0": "frame_ms=60_000.0"},
     "docs/video.md": {"width=540, height=720": "width=54, height=72"},
 }
 """What of a page is exchanged: the same at a size for tests."""
