@@ -6,6 +6,7 @@ does not cover. No photo is written but into the folder that the user names.
 """
 
 import dataclasses
+import functools
 import subprocess
 import sys
 import zipfile
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+import jax
 import numpy as np
 from scipy import ndimage
 
@@ -34,6 +36,8 @@ from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.io.npz import write_npz
+from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
+from humangs_jax.losses.perceptual import Lpips, lpips
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
 FRAMES = (0, 12, 33, 66, 90)
@@ -293,7 +297,7 @@ def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[dict[str, float]]:
-    """Of each view the PSNRs (dB) of the avatar of the others, against the man on white as he was photographed.
+    """Of each view the PSNRs (dB) and LPIPS of the avatar of the others, against the man on white as he was photographed.
 
     Renderings are brought to the exposure of the view's camera, which is found from all photos.
 
@@ -308,24 +312,37 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
         drawn = draw_views(avatar, shown)
         images = multiplied(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
         truth = dataclasses.replace(shown, images=photos.truth()[[view]], masks=photos.careful[[view]])
-        found.append(_psnrs(images, truth))
+        found.append(_scores(images, truth))
     return found
 
 
 def drawn_scores(avatar: Avatar, views: Capture, photos: RealFrame, shown: Sequence[int]) -> dict[str, float]:
-    """psnr and psnr_fg (dB) of an avatar from the cameras and in the poses of these views, means over them."""
+    """psnr and psnr_fg (dB), and LPIPS, of an avatar from the cameras and in the poses of these views, means over them."""
     truth = photos.truth()[list(shown)]
     return drawn_psnrs(avatar, dataclasses.replace(views, images=truth, masks=photos.careful[list(shown)]))
 
 
 def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
     """The same against the photos of these views."""
-    return _psnrs(draw_views(avatar, truth).images, truth)
+    return _scores(draw_views(avatar, truth).images, truth)
 
 
-def _psnrs(images, truth):
+def _scores(images, truth):
     scores = score(images, truth)
-    return {"psnr": float(scores.psnr), "psnr_fg": float(scores.psnr_fg)}
+    found = {"psnr": float(scores.psnr), "psnr_fg": float(scores.psnr_fg)}
+    if (network := _alex()) is not None:
+        pairs = zip(np.clip(images, 0, 1), truth.images, strict=True)
+        found["alex"] = float(np.mean([_lpips(network, *map(np.float32, pair)) for pair in pairs]))
+    return found
+
+
+_lpips = jax.jit(lpips)
+
+
+@functools.cache
+def _alex() -> Lpips | None:
+    """LPIPS, where the extra `lpips` is installed."""
+    return load_lpips("alex") if "alex" in installed_lpips() else None
 
 
 def body_ious(body: Capture, careful: Float[np.ndarray, "v s s"]) -> list[float]:

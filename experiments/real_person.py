@@ -54,7 +54,7 @@ from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.refine import refine
 
-PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2)}
+PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2), "alex": ("LPIPS alex", 3)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
 TABLES = (
     (
