@@ -204,7 +204,7 @@ def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
     refined: report of the refined demo
     timed: report of the unrefined demo, nothing compiled before; without it times stay
     """
-    paths = (REPOSITORY / "docs" / "results" / f"{name}.json" for name in ("evaluation_views", "refinement_32"))
+    paths = (REPOSITORY / "docs" / "results" / f"{name}.json" for name in ("evaluation_views", "appearance"))
     people = [json.loads(path.read_text())["numbers"] for path in paths]
     run.show(readme_quality(json.loads(refined.read_text()), *people), table="readme_quality")
     if timed:
@@ -214,28 +214,25 @@ def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
 def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
     """The demo person and the test people.
 
-    Raises: ValueError if the demo was not refined, or the people or the weights of the two tables are not the same.
+    Raises: ValueError if the demo was not refined, or the weights of the two tables are not the same.
     """
     if "refined" not in demo:
         raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0")
-    count = people["people"]
-    if refined["people"] != count:
-        raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
     if people["settings"]["weights"] != refined["settings"]["weights"]:
-        raise ValueError("evaluation_views and refinement_32 are of different weights: measure them again")
-    by_size = {name.split()[0]: lengths for name, lengths in refined["means"].items()}
+        raise ValueError("evaluation_views and appearance are of different weights: measure them again")
+    scored = lambda size, task: refined["means"]["all"][f"{size} 0 {task}"]["default"]
     feed_forward = people["by_views"]["4"]["novel"]
     rows = {
-        f"{count} synthetic people, 256 px, feed-forward": feed_forward,
-        "the same, refined for 1 s": by_size["256"]["1"]["novel"],
-        "512 px, refined for 1 s": by_size["512"]["1"]["novel"],
-        "512 px, refined for 1 s, in poses that no photo shows": by_size["512"]["1"]["animation"],
+        f"{people['people']} synthetic people, 256 px, feed-forward": feed_forward,
+        f"{refined['people']} of them, as `humangs reconstruct` makes them": scored(256, "novel"),
+        "the same, 512 px": scored(512, "novel"),
+        "the same, 512 px, in poses that no photo shows": scored(512, "animation"),
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
-        "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "ssim", "psnr_fg")},
+        "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "psnr_fg")},
     }
-    columns = {"psnr": 1, "ssim": 3, "psnr_fg": 1}
-    shown = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
-    header = ["", "PSNR", "SSIM", "foreground PSNR"]
+    columns = {"psnr": 1, "psnr_fg": 1, "alex": 3}
+    shown = lambda scores: ["" if scores.get(key) is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
+    header = ["", "PSNR", "foreground PSNR", "LPIPS (Alex)"]
     return markdown_table(header, [[name, *shown(scores)] for name, scores in rows.items()])
 
 

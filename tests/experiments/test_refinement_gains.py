@@ -39,20 +39,21 @@ DEMO = SCORES | {
 }
 
 
-def test_readme_quality_is_of_the_same_people_and_weights():
+def test_readme_quality_is_of_the_same_weights():
     settings = {"settings": {"weights": "a"}, "people": 3}
-    baseline = {"baseline_psnr": 20.67, "baseline_ssim": 0.8, "baseline_psnr_fg": 11.28}
+    baseline = {"baseline_psnr": 20.67, "baseline_psnr_fg": 11.28}
     people = settings | {"by_views": {"4": {"novel": SCORES | baseline}}}
-    lengths = {"1": {task: SCORES for task in ("novel", "animation")}}
-    refined = settings | {"means": {f"{size} 4 network, 4 iterations": lengths for size in (256, 512)}}
+    seen = {"default": SCORES | {"alex": 0.0506}, "iterations alone": {}}
+    cells = {f"{size} 0 {task}": seen for size in (256, 512) for task in ("novel", "animation")}
+    refined = settings | {"people": 2, "means": {"all": cells}}
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = readme_quality(demo, people, refined).splitlines()[2:]
-    assert rows[0] == "| 3 synthetic people, 256 px, feed-forward | 27.4 | 0.946 | 18.8 |" and len(rows) == 6
-    assert rows[4] == "| the demo's person, 256 px, refined for 15 s | 29.2 | 0.946 | 18.8 |"
-    assert rows[5] == "| vertex-color baseline, 256 px | 20.7 | 0.800 | 11.3 |"
+    assert rows[0] == "| 3 synthetic people, 256 px, feed-forward | 27.4 | 18.8 |  |" and len(rows) == 6
+    assert rows[1] == "| 2 of them, as `humangs reconstruct` makes them | 27.4 | 18.8 | 0.051 |"
+    assert rows[4] == "| the demo's person, 256 px, refined for 15 s | 29.2 | 18.8 |  |"
+    assert rows[5] == "| vertex-color baseline, 256 px | 20.7 | 11.3 |  |"
     for said, changed in {
         "expected `humangs demo` without": (DEMO, people, refined),
-        "2 people were refined: expected the same 3": (demo, people, refined | {"people": 2}),
         "of different weights": (demo, people, refined | {"settings": {"weights": "b"}}),
     }.items():
         with pytest.raises(ValueError, match=said):
