@@ -88,7 +88,7 @@ def appearance(
     def measure(seed):
         row: dict[str, Any] = {}
         person = functools.cache(lambda size: make_evaluation_subject(seed, start.body, (VIEWS,), size, start.held_out))
-        for size, wrong in itertools.product(sizes, off):
+        for size, wrong in itertools.product(sorted(sizes), off):  # pictures are of the last
             subject = with_body_off(person(size), wrong)
             truth, inputs, drawn = subject.held_out, subject.inputs(VIEWS), {}
             for name in variants:
