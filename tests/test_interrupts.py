@@ -21,8 +21,11 @@ from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.motion import Motion, load_motion, save_motion
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals")
-START = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from humangs_jax import cli; "
-"""Shells start what runs in the background without the usual handler."""
+START = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+    "from humangs_jax import cli; "
+)
+"""Shells start what runs in the background without the usual handlers."""
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
 
 

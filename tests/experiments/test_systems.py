@@ -226,7 +226,7 @@ def test_shells_and_maps_that_do_not_fit_are_refused():
 def test_every_system_has_both_sizes_of_the_same_parts():
     for make in SYSTEMS.values():
         published, bench = make("published"), make("bench")
-        assert bench.conventions.image_size == 128 < published.conventions.image_size
+        assert bench.conventions.image_size == 32 < published.conventions.image_size
         kinds = lambda config: [type(part) for part in (config.architecture.reader, config.architecture.decoder)]
         assert kinds(published) == kinds(bench)
     assert SYSTEMS["lhm_plus"]("bench").architecture.reader.pooling == 4

@@ -59,7 +59,7 @@ def test_one_seed_has_no_interval():
     ("how", "said"),
     [
         ({"variants": {"base": {}}}, "'base': is the name"),
-        ({"variants": {"a": {"model.depth": 1}}}, "model.depth: HumanGSConfig has no field 'depth'"),
+        ({"variants": {"a": {"model.depth": 1}}}, "model.depth: TrainConfig has no such field"),
         ({"seeds": 0}, "seeds 0: expected at least 1"),
         ({"budget": "soon"}, "budget 'soon': expected a time"),
         ({"metric": "mse"}, "'mse': is none of validation: psnr_fg"),
