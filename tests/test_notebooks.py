@@ -124,7 +124,7 @@ def runs(line):
 
 def framed(image):
     """What lies inside of each frame of a figure."""
-    line = np.all(abs(image - FRAME) <= 12, axis=-1)  # of a JPEG
+    line = np.all(abs(image - FRAME) <= 15, axis=-1)  # of a JPEG
     rows, found = {i: runs(row) for i, row in enumerate(line) if row.sum() >= SMALLEST}, []
     for top in rows:
         for left, right in rows[top]:
