@@ -187,8 +187,11 @@ def appearance_section(numbers: dict[str, Any], start: Any) -> str:
 # A blind comparison -------------------------------------------------------------------------------------------------------
 
 
-def write_pairs(folder: Path, pictures: dict[str, list[np.ndarray]], names: Sequence[str]) -> None:
-    """Sheets of truth, A and B for each person and detail in random order, and key.json: which of the variants A is."""
+def shuffled(pictures: dict[str, list[np.ndarray]], names: Sequence[str]) -> tuple[list[np.ndarray], list[dict[str, str]]]:
+    """Truth, A and B for each person and detail in random order; and for each which of the variants A and B are.
+
+    pictures: by person the details of the truth and of both variants.
+    """
     rng, key, tiles = np.random.default_rng(0), [], []
     which = [(seed, i) for seed in pictures for i in range(len(JUDGED))]
     for number in rng.permutation(len(which)):
@@ -197,6 +200,12 @@ def write_pairs(folder: Path, pictures: dict[str, list[np.ndarray]], names: Sequ
         truth, *both = (image[detail].repeat(PAIR_ZOOM, 0).repeat(PAIR_ZOOM, 1) for image in pictures[seed])
         tiles += [truth, both[flipped], both[1 - flipped]]
         key.append({"person": seed, "detail": JUDGED[detail], "A": names[flipped], "B": names[1 - flipped]})
+    return tiles, key
+
+
+def write_pairs(folder: Path, pictures: dict[str, list[np.ndarray]], names: Sequence[str]) -> None:
+    """Sheets of `shuffled` pairs, and key.json."""
+    tiles, key = shuffled(pictures, names)
     folder.mkdir(parents=True, exist_ok=True)
     for first in range(0, len(key), PAIRS_A_SHEET):
         shown = tiles[3 * first : 3 * (first + PAIRS_A_SHEET)]

@@ -67,8 +67,8 @@ FIRST_SEED = 6000
 PHOTOS, TARGETS = 4, 6
 COUNTS = (1, 2, 4, 4, 4, 4, 6)
 """Numbers of photos that a step draws from; with 6, the first two targets are photos, too."""
-ROUND_WEIGHT = 0.9
-"""A round counts this much less than the next."""
+ITERATION_WEIGHT = 0.9
+"""An iteration counts this much less than the next."""
 WEIGHTS = {"squared": 10.0, "absolute": 1.0, "structural": 0.2, "silhouette": 0.2}
 VALIDATED, VALIDATE_EVERY, SAVE_EVERY = 8, 250, 50
 MARGIN = 2.0
@@ -282,7 +282,7 @@ def step_gradient(
         count = 2 if i == iterations - 1 else 1
         chosen = [sample.views[targets[(i + j) % len(targets)]] for j in range(count)]
         each = [view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)[1] for view in chosen]
-        cotangents.append(ROUND_WEIGHT ** (iterations - 1 - i) * sum(each) / count)
+        cotangents.append(ITERATION_WEIGHT ** (iterations - 1 - i) * sum(each) / count)
     return compiled(through_iterations)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
 
 
@@ -300,7 +300,7 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
             layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
             for layer, own in given.items()
         ):
-            raise ValueError(f"{options.start}: these are not weights of the network of a round")
+            raise ValueError(f"{options.start}: expected weights of a `Refiner`")
         variables = {"params": new | given}
     perceptual = (options.lpips, load_lpips("alex")) if options.lpips else None
     rate = optax.warmup_cosine_decay_schedule(

@@ -317,10 +317,8 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config
 
 def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> Avatar:
     """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
-    conventions, avatar = (
-        config.conventions,
-        make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config),
-    )
+    conventions = config.conventions
+    avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
     if conventions.skinning_reach is not None and outputs.skinning_weights is None:
         avatar = with_spread_weights(avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach)
     if conventions.light and outputs.skinning_weights is None:

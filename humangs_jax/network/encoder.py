@@ -175,7 +175,7 @@ def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
 def touched_patches(foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int) -> Bool[Array, " p"]:
     """Which patches of all views the foreground touches; views beyond `view_count` are padding."""
     if view_count is not None:
-        foreground &= (jnp.arange(len(foreground)) < view_count)[:, None, None]
+        foreground = foreground & (jnp.arange(len(foreground)) < view_count)[:, None, None]
     return jnp.any(patchify(foreground[..., None].astype(jnp.float32), patch_size) > 0, axis=(1, 2))
 
 

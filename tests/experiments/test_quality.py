@@ -7,11 +7,14 @@ import json
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from evaluation_cases import capture_from, random_lpips
 
-from experiments import bodies, harness, quality, subjects
+from experiments import appearance, bodies, harness, pictures, quality, subjects
+from experiments.refinement import body_off
+from humangs_jax.body.model import BodyPose
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
@@ -181,3 +184,51 @@ def test_the_section_has_means():
     section = quality.views_section(people(v1=[21, 22], v4=[25, 26]), 4, "about")
     assert "| novel poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
     assert "LPIPS" not in section
+
+
+# What eyes see ------------------------------------------------------------------------------------------------------------
+
+
+def pictures_of(people):
+    """Details of a person: the truth white, those of "before" dark, those of "now" light."""
+    shade = lambda value: np.full((len(pictures.DETAILS), pictures.DETAIL_PIXELS, pictures.DETAIL_PIXELS, 3), value)
+    return {str(person): [shade(1.0), shade(0.2), shade(0.8)] for person in range(people)}
+
+
+def test_the_key_of_a_blind_comparison_names_what_is_shown():
+    tiles, key = appearance.shuffled(pictures_of(8), ("before", "now"))
+    assert len(tiles) == 3 * len(key) == 3 * 8 * len(appearance.JUDGED)
+    for i, pair in enumerate(key):
+        shades = [float(tile.mean()) for tile in tiles[3 * i : 3 * i + 3]]
+        assert shades == pytest.approx([1.0, *({"before": 0.2, "now": 0.8}[pair[letter]] for letter in "AB")])
+    assert {pair["A"] for pair in key} == {"before", "now"}
+    assert len({(pair["person"], pair["detail"]) for pair in key}) == len(key)
+
+
+def test_votes_are_counted_for_what_was_shown(tmp_path, capsys):
+    appearance.write_pairs(tmp_path / "pairs", pictures_of(4), ("before", "now"))
+    key = json.loads((tmp_path / "pairs" / "key.json").read_text())
+    for_now = ["A" if pair["A"] == "now" else "B" for pair in key]
+    (tmp_path / "votes.txt").write_text(" ".join(["=", *for_now[1:]]))
+    run(appearance.appearance_votes, tmp_path / "pairs", tmp_path / "votes.txt")
+    assert f"| all | 0 | {len(key) - 1} | 1 |" in capsys.readouterr().out
+    (tmp_path / "votes.txt").write_text("A B")
+    with pytest.raises(SystemExit):
+        run(appearance.appearance_votes, tmp_path / "pairs", tmp_path / "votes.txt")
+    assert f"expected A, B or = for each of {len(key)} pairs" in capsys.readouterr().err
+
+
+def test_loosest_and_worst_people_are_listed_apart():
+    rows = [{"512 0 novel": {"before": {"psnr_fg": float(i)}}, "loose": -float(i)} for i in range(12)]
+    groups = appearance.groups_of(rows, "before")
+    assert groups == {"all": rows, "10 loosest": rows[:10], "5 worst": rows[:5]}
+    assert list(appearance.groups_of(rows[:10], "before")) == ["all"]
+
+
+def test_a_body_that_is_off_is_off_by_the_same_in_all_poses():
+    poses = jax.vmap(BodyPose)(jnp.zeros((3, 4, 3)), jnp.zeros((3, 3)))
+    moved, betas = body_off(poses, jnp.zeros(5), 5.0, seed=1)
+    for array in (moved.rotations, moved.translation):
+        np.testing.assert_array_equal(array[0], array[2])
+        assert np.asarray(array).any()
+    assert np.asarray(betas).any() and not np.asarray(body_off(poses, jnp.zeros(5), 0.0, seed=1)[1]).any()
