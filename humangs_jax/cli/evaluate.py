@@ -121,7 +121,7 @@ class Evaluate:
         named += [file for files in vars(self.lpips).values() for file in files]
         said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None and self.page_images]
         for path in named:
-            files = [] if path is None else [path, *path.glob("*"), *path.glob("*/*")]
+            files = [] if path is None else [path, *sorted(path.rglob("*"))]
             said += [(str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files if file.exists()]
         try:
             root = user_cache() / "humangs_jax" / "evaluations"
