@@ -25,7 +25,7 @@ from PIL import Image
 from experiments import chromium
 from experiments.harness import Run, entry
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.files import export
+from humangs_jax.avatar.export.gaussians import export
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.images import read_image
 from humangs_jax.viewer.page import write_page

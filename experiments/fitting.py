@@ -21,9 +21,9 @@ from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
 from humangs_jax.fitting.triangulation import triangulate, triangulate_robustly
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import make_subject
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 
 POSE_STREAM, CAMERA_STREAM, ERROR_STREAM = 21, 22, 23
 

@@ -16,7 +16,7 @@ from experiments.results import markdown_table
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.apps.check import draw_body
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.sheets import contact_sheet
+from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import pose_body, shape_body
@@ -34,9 +34,9 @@ from humangs_jax.fitting.refine import overlap, posed_vertices, refine_capture
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import make_subject, seeds_of
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.people.writer import View, capture_views, stand
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine

@@ -16,12 +16,11 @@ from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.people import anatomy, cameras
+from humangs_jax.people import anatomy, surroundings
 from humangs_jax.people.anatomy import Rotations
 from humangs_jax.people.subject import DEMO, describe, make_subject, padded, pose_subject, render_view
 from humangs_jax.people.writer import sample_motion, sample_pose
-from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
@@ -70,7 +69,7 @@ def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
     """Pixels of one person in one pose, and shares of faults."""
     posed = sample_pose(make_subject(seed, body), 0)
     rng = np.random.default_rng([seed, 77, 0])
-    camera = cameras.cameras_around(rng, posed.vertices, cameras.spread_azimuths(rng, 1), size)[0]
+    camera = surroundings.cameras_around(rng, posed.vertices, surroundings.spread_azimuths(rng, 1), size)[0]
     pixels, *counts = count_faults(body, posed, camera)
     return {"pixels": float(pixels)} | {name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)}
 

@@ -19,7 +19,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.losses import metrics
+from humangs_jax.losses.losses import masked_psnr, psnr
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import render
 from humangs_jax.viewer.page import write_page
@@ -132,7 +132,7 @@ def compare(image: Any, avatar: Avatar, camera: Camera, pose: BodyPose) -> tuple
     """PSNR to `hg.render` of the whole image and of the person, dB."""
     rendering = render(skin(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering])
     truth, image = jnp.clip(rendering.rgb, 0, 1), jnp.asarray(image)
-    return float(metrics.psnr(image, truth)), float(metrics.masked_psnr(image, truth, rendering.alpha))
+    return float(psnr(image, truth)), float(masked_psnr(image, truth, rendering.alpha))
 
 
 def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float, float]:

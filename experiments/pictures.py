@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.harness import Run, entry
 from experiments.subjects import TASKS, Drawn, task_views
-from humangs_jax.avatar.sheets import GAP, tile, write_texts
+from humangs_jax.avatar.video import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import to_uint8, write_png
 

@@ -30,8 +30,8 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.subject import make_subject
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.people.writer import View, capture_views, sample_pose
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER

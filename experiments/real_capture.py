@@ -34,8 +34,8 @@ from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import resized, to_uint8, write_png
-from humangs_jax.io.npz import write_npz
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips, lpips
 

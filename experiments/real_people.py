@@ -29,8 +29,8 @@ from experiments.real_capture import (
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
-from humangs_jax.avatar.sheets import tile
 from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.video import tile
 from humangs_jax.body.library import load_body
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture
@@ -45,8 +45,8 @@ from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, moved_capture
 from humangs_jax.fitting.similarity import Similarity, align_points
 from humangs_jax.fitting.state import StateStd
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_image, resized, to_uint8
-from humangs_jax.io.npz import write_npz
 
 PHOTOS, NOVEL = 4, 4
 COLUMNS = 6

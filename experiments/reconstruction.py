@@ -33,7 +33,7 @@ from humangs_jax.network.encoder import needed_tokens
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.weights import expected_variables, load_weights
-from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
+from humangs_jax.people.surroundings import VERTICAL_FOV, bounding_sphere
 from humangs_jax.rendering.buffers import round_up
 
 DISTANCE_FACTOR = 1.8

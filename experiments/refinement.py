@@ -17,7 +17,7 @@ from experiments.subjects import TASKS, People, make_evaluation_subject, score_t
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.losses.metrics import semi_transparent
+from humangs_jax.losses.losses import semi_transparent
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import SHIPPED
 from humangs_jax.refinement.refine import refine_with_report

@@ -36,8 +36,8 @@ from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
-from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12

@@ -33,12 +33,12 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.arrays import read_npz, write_npz
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import to_uint8
-from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import read_json
 from humangs_jax.losses.loss_networks import load_lpips
-from humangs_jax.losses.metrics import structural_dissimilarity
+from humangs_jax.losses.losses import structural_dissimilarity
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.weights import load_weights
 from humangs_jax.people.bank import build_bank, load_bank, save_bank

@@ -10,8 +10,8 @@ from experiments.harness import Run, entry
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import a_pose_of, images, turntable_views
-from humangs_jax.avatar.sheets import tile
 from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.video import tile
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture

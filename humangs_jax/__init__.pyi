@@ -29,7 +29,7 @@ from .apps.settings import tune as tune
 from .avatar.avatar import Avatar as Avatar
 from .avatar.animate import animate as animate, skin as skin
 from .avatar.video import write_video as write_video
-from .avatar.export.files import export as export
+from .avatar.export.gaussians import export as export
 from .viewer.page import show as show
 
 # Gaussians -> image

@@ -3,8 +3,8 @@
 import numpy as np
 import OpenEXR
 
+from humangs_jax.avatar.layers import RGBA, STANDARD_ATTRIBUTES, ExrView
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.exr import RGBA, STANDARD_ATTRIBUTES, ExrView
 
 
 def read_exr(path):

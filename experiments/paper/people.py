@@ -19,12 +19,11 @@ from humangs_jax.data.loading import CaptureSource, Example, PeopleCache, Stored
 from humangs_jax.data.loading.captures import CaptureFolder
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.fabrics import Fabric, random_color
 from humangs_jax.people.outfits import Garment
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.shading import sample_lights
 from humangs_jax.people.subject import Person, PosedSubject, describe, make_subject, seeds_of
+from humangs_jax.people.surroundings import cameras_around, sample_lights, spread_azimuths
 from humangs_jax.people.writer import HELD_OUT, View, capture_views, stand
 from humangs_jax.training.sources import MakeSource, cached_people
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.quick_check import faults
-from humangs_jax.avatar.sheets import contact_sheet, tile
+from humangs_jax.avatar.video import contact_sheet, tile
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
@@ -37,8 +37,7 @@ from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8, write_png
-from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, vertex_normals
 
 LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""

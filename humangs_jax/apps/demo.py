@@ -19,13 +19,12 @@ import numpy as np
 from humangs_jax.apps.settings import Settings
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.ply import write_ply
+from humangs_jax.avatar.export.splats import write_ply
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.avatar.sheets import contact_sheet, side_by_side
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.avatar.video import write_video
+from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.core.progress import say, stage
 from humangs_jax.data.capture import Capture, load_capture

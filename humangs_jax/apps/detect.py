@@ -402,7 +402,7 @@ def _images(photos: Sequence[PhotoPeople], numbers: Sequence[int]) -> list[Image
 
 def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
     """The photos side by side, everybody in a color and with a number. person: the one who was chosen."""
-    from humangs_jax.avatar.sheets import contact_sheet
+    from humangs_jax.avatar.video import contact_sheet
 
     pictures = [_picture(photo, person) for photo in photos]
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))

@@ -10,8 +10,7 @@ tells renderers so.
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import light_values, relit
+from humangs_jax.avatar.avatar import Avatar, light_values, relit
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments

@@ -9,20 +9,25 @@ part: the joint that most of the pixel's color follows, 1 for the first of the h
     Gaussian follows the joint of its largest skinning weight.
 
 None of these is multiplied by alpha; they are 0 where alpha is.
+
+The OpenEXR file is lossless (ZIP); several views are its parts. The header of each has its camera: `K` (3x3, pixels) and
+`cam_from_world` (4x4, OpenCV, metres), float32, exact. R, G, B and A are premultiplied, as compositing programs expect. Colors
+are the values of the photos, as in PNG files: encoded for a display by the curve of sRGB, not linear in light.
 """
 
 import dataclasses
+import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.avatar import Avatar, surface_normals, turned_normals
 from humangs_jax.avatar.frames import draw, draw_gaussians, image_of, posed, splatting_of
-from humangs_jax.avatar.light import surface_normals, turned_normals
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
@@ -30,8 +35,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.atomic import add_files
-from humangs_jax.io.exr import ExrView, write_exr
+from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import limits
 from humangs_jax.rendering.gaussians import Gaussians
@@ -42,6 +46,31 @@ LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
 COVERED = 0.5
 """Pixels of less alpha have no part."""
+RGBA = ("R", "G", "B", "A")
+DEPTH = "Z"
+WIDE = (DEPTH, "position.")
+"""How the names of channels start that stay in 32 bits when others are halved: metres, of which half precision has steps of 2 mm
+at 4 m."""
+STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
+"""Header strings with a meaning of their own in OpenEXR: neither written nor returned as ours."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExrView:
+    """One rendered view.
+
+    rgba: (h, w, 4) colors and coverage. depth: (h, w) metres, or None.
+    K, cam_from_world: (3, 3) pixels and (4, 4) metres of its camera, both or neither.
+    name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for the header.
+    """
+
+    rgba: Float[np.ndarray, "h w 4"]
+    depth: Float[np.ndarray, "h w"] | None = None
+    K: Float[np.ndarray, "3 3"] | None = None
+    cam_from_world: Float[np.ndarray, "4 4"] | None = None
+    name: str = ""
+    channels: Mapping[str, Float[np.ndarray, "h w"]] = dataclasses.field(default_factory=dict)
+    attributes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,3 +218,69 @@ def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
 def _posed_normals(normals: Float[Array, "g 3"], avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
     transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     return turned_normals(normals, blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3])
+
+
+# The file -------------------------------------------------------------------------------------------------------------
+
+
+def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool = False) -> None:
+    """Write one view, or several as parts of one file (all of one size); the file appears whole or not at all.
+
+    Unnamed views are called view000, view001, ... half: store all in 16 bits but Z and `position.*`, which stay in 32 like
+    everything without it; numbers beyond 65504 become infinite.
+
+    Raises: ValueError naming the view and what does not fit; OSError if the file cannot be written.
+    """
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
+
+    views = [views] if isinstance(views, ExrView) else list(views)
+    if not views:
+        raise ValueError("views: expected at least one, got none")
+    names = [view.name or f"view{i:03d}" for i, view in enumerate(views)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"views: expected different names, got {names}")
+    if len({view.rgba.shape for view in views}) > 1:  # parts of a file share one display window
+        raise ValueError(f"views: expected one image size, got {sorted({view.rgba.shape[:2] for view in views})}")
+    parts = [_to_part(view, name, half) for view, name in zip(views, names, strict=True)]
+
+    def write(temporary: Path):
+        content = io.BytesIO()  # it knows names in UTF-8 only
+        with OpenEXR.File(parts) as file:
+            file.write(content)
+        temporary.write_bytes(content.getvalue())
+
+    try:
+        replace_file(path, write)
+    except RuntimeError as error:
+        raise OSError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
+
+
+def _to_part(view: ExrView, name: str, half: bool) -> Any:
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
+
+    height, width = view.rgba.shape[:2]
+    channels = {channel: view.rgba[..., i] for i, channel in enumerate(RGBA)}
+    if view.depth is not None:
+        channels[DEPTH] = view.depth
+    for channel, image in view.channels.items():
+        if channel in channels:
+            raise ValueError(f"view {name!r}: channels: {channel} is there already")
+        channels[channel] = image
+    # OpenEXR writes strided arrays wrongly in silence and refuses every type but its own
+    kinds = {name: np.float16 if half and not name.startswith(WIDE) else np.float32 for name in channels}
+    with np.errstate(over="ignore"):
+        channels = {name: np.ascontiguousarray(image, kinds[name]) for name, image in channels.items()}
+    for channel, image in channels.items():
+        if image.shape != (height, width):
+            raise ValueError(f"view {name!r}: channel {channel}: expected shape {(height, width)}, got {image.shape}")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for key, value in view.attributes.items():
+        if key in STANDARD_ATTRIBUTES:
+            raise ValueError(f"view {name!r}: attributes: {key} has a meaning of its own in OpenEXR")
+        header[key] = str(value)
+    if (view.K is None) != (view.cam_from_world is None):
+        raise ValueError(f"view {name!r}: expected both K and cam_from_world, or neither")
+    if view.K is not None:
+        header["K"] = np.ascontiguousarray(view.K, np.float32)
+        header["cam_from_world"] = np.ascontiguousarray(view.cam_from_world, np.float32)
+    return OpenEXR.Part(header, channels, name)

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.animate import with_low_pass
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
+from humangs_jax.avatar.avatar import Avatar, Light, light_coefficients, light_terms, log_brightness, turned_normals
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
@@ -41,7 +40,7 @@ from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.parts import HumanGSInputs, HumanGSOutputs, Variables
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
-from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2

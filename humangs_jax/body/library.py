@@ -22,8 +22,7 @@ from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.arrays import ArrayFile, check_array, check_indices, check_joints, check_row_sums
-from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.arrays import ArrayFile, check_array, check_indices, check_joints, check_row_sums, read_npz, write_npz
 from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, reading
 
 FORMAT = "humangs-body-1"

@@ -176,7 +176,7 @@ class Render:
             raise UsageError("--camera: expected a folder as --out, and no --views")
         with stage("starting"):
             from humangs_jax import load_gaussians
-            from humangs_jax.avatar.splat_views import circle_cameras, file_cameras, splat_images, write_splat_views
+            from humangs_jax.avatar.frames import circle_cameras, file_cameras, splat_images, write_splat_views
             from humangs_jax.avatar.video import check_video, write_video
 
             check_video(self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != "")
@@ -233,7 +233,7 @@ class View:
         if self.capture is not None and not self.live:
             raise UsageError("--capture: only with --live")
         if self.live:
-            from humangs_jax.viewer.live import follow
+            from humangs_jax.viewer.page import follow
 
             motion = None if self.motion is None else self.part.load(self.motion)
             follow(self.avatar, self.capture, motion, self.port, self.browser)

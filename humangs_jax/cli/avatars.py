@@ -376,7 +376,7 @@ class Export:
         return None if out is None else chosen_format(out.suffix, self.mesh)
 
     def _write(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
-        from humangs_jax.avatar.export.files import export
+        from humangs_jax.avatar.export.gaussians import export
 
         form, numbers = self._format(out), None
         assert form is not None  # its suffix was checked
@@ -394,7 +394,7 @@ class Export:
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
         """The frames asked for, and their numbers where there are many."""
-        from humangs_jax.avatar.export.files import frame_range
+        from humangs_jax.avatar.export.gaussians import frame_range
         from humangs_jax.core.pytree import replace
 
         count = len(motion.translations)

@@ -44,9 +44,9 @@ from humangs_jax.data.photos import (
     write_description,
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.arrays import read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_row, png_bytes, resized, write_png
-from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, check_limit, reading
 
 DEFAULT_BODY = "makehuman"

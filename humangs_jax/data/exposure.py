@@ -18,8 +18,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.usable_views import unusable_views, usable_views
 from humangs_jax.data.views import standardize
 from humangs_jax.geometry.camera import Camera, project
-from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 SIZE = 256
 """Pixels a side of the crops around the person that are compared."""

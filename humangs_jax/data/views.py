@@ -26,7 +26,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import HumanGSInputs, subject_unit
 from humangs_jax.network.reader import project_vertices, visible_vertices
-from humangs_jax.rendering.mesh.position_map import (
+from humangs_jax.rendering.mesh.rasterizer import (
     BACKGROUND,
     BACKGROUND_DEPTH,
     gouraud_position_map,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.sheets import error_colors
+from humangs_jax.avatar.video import error_colors
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments

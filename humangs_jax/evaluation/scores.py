@@ -26,7 +26,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of
 from humangs_jax.evaluation.tables import Row, mean_scores
 from humangs_jax.io.images import resized
-from humangs_jax.losses.metrics import (
+from humangs_jax.losses.losses import (
     GAUSSIAN,
     TORCHMETRICS,
     UNIFORM,

@@ -31,8 +31,8 @@ from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport, listed
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
+from humangs_jax.io.arrays import read_npz, write_npz
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
-from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"

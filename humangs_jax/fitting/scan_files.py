@@ -27,10 +27,10 @@ from humangs_jax.fitting.residuals.keypoints import group_by_frame
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
 from humangs_jax.io.mesh import read_meshes
-from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import Refused, read_json, reading, write_json
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.io.npz import plain_array
 from humangs_jax.io.reading import Refused, check_limit, limits, read_bytes, reading
 
 REFUSED = (
@@ -342,6 +341,17 @@ def objects(value: Any) -> Any:
     if not isinstance(held, list):
         return value
     return held[0] if value.state.get("shape") == () and len(held) == 1 else held
+
+
+def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of the machine's byte order from bytes of a file, which may hold what numpy itself never writes."""
+    array = np.frombuffer(data, dtype).reshape(shape) if dtype.itemsize else np.zeros(shape, dtype)
+    if dtype.kind == "b":
+        return array.view(np.uint8) != 0
+    array = array.astype(dtype.newbyteorder("="), copy=False)
+    if dtype.kind == "U" and array.size and np.ascontiguousarray(array).reshape(-1).view(np.uint32).max() > 0x10FFFF:
+        raise Refused("strings with characters that do not exist")
+    return array
 
 
 def as_array(value: Any) -> np.ndarray:

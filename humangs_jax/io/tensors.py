@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.io.npz import open_archive, read_header
+from humangs_jax.io.arrays import open_archive, read_header
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, limits, open_file, read_bytes, reading, shown
 from humangs_jax.io.restricted_pickle import NAMES, Call, RestrictedUnpickler, objects
 

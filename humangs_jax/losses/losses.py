@@ -1,16 +1,18 @@
-"""The terms of the training loss: their weights, the table that a step adds up, and the losses, unreduced."""
+"""The terms of the training loss, unreduced, and their weights; metrics of an image against a photo, both (h, w, 3) in [0, 1]."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Annotated, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from humangs_jax.core.array_types import Array, Float, Scalar
+from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.configuration import Range, Share, Weight, configuration
+from humangs_jax.core.numerics import safe_divide
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.metrics import multiscale_structural_dissimilarity
 from humangs_jax.losses.perceptual import lpips, perceptual_loss, vgg16_loss
 from humangs_jax.network.parts import Drawn
 
@@ -149,3 +151,175 @@ def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
     Without tight Gaussians (k = 0) it is 0.
     """
     return jnp.sum(jnp.square(tight_offsets), axis=(-2, -1)) / max(1, tight_offsets.shape[-2])
+
+
+# Metrics ---------------------------------------------------------------------------------------------------------------
+
+
+LARGEST_PSNR = 100.0
+"""dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
+FOG = (0.05, 0.9)
+"""Alphas between these are semi-transparent foreground."""
+BOUNDARY = 3 / 256
+"""Half the width of the band at the silhouette, of the image's side."""
+
+
+def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """PSNR of mean squared errors of values in [0, 1], at most 100 dB."""
+    return -10 * jnp.log10(jnp.maximum(mean_squared_error, 10 ** (-LARGEST_PSNR / 10)))
+
+
+def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Scalar:
+    """Peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped to [0, 1]."""
+    return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
+
+
+def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]) -> Scalar:
+    """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
+    errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
+    return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
+
+
+def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
+    """Share of the pixels of a mask where alpha is neither near 0 nor near 1, see `FOG`; 0 where the mask is empty."""
+    inside = mask > 0.5
+    partly = (alpha > FOG[0]) & (alpha < FOG[1]) & inside
+    return jnp.sum(partly) / jnp.maximum(jnp.sum(inside), 1)
+
+
+def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
+    """Intersection over union of the pixels where alpha and where the mask is above a half; 1 where both are empty."""
+    drawn, inside = alpha > 0.5, mask > 0.5
+    union = jnp.sum(drawn | inside)
+    return jnp.where(union > 0, jnp.sum(drawn & inside) / jnp.maximum(union, 1), 1.0)
+
+
+def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """1 in the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, 0 elsewhere; on the host."""
+    from scipy.ndimage import distance_transform_edt
+
+    inside = np.asarray(mask) > 0.5
+    distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
+    return (distance <= BOUNDARY * len(inside)).astype(np.float32)
+
+
+def boundary_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in dB of two (h, w, 3) images in the `boundary_band` of a mask (h, w)."""
+    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), jnp.asarray(boundary_band(mask))))
+
+
+# Structural similarity (Wang et al., 2004): differentiable and fast on every backend. Windows differ between papers. `GAUSSIAN`
+# and `UNIFORM` give the numbers of scikit-image's `structural_similarity(data_range=1, channel_axis=-1)`, the first with
+# `win_size=11, gaussian_weights=True`; `TORCHMETRICS` those of torchmetrics'
+# `StructuralSimilarityIndexMeasure(data_range=1.0)`, which has the covariances of the original code (N instead of N - 1). Only
+# pixels whose whole window lies in the image count. The window is separable, and a sum of shifted slices is some forty times
+# faster on a CPU than the depthwise convolution.
+
+STABILIZERS = (0.01**2, 0.03**2)
+"""C1 and C2 of the paper, for values in [0, 1]."""
+MIDDLE = 0.5
+"""Moments are taken about this grey: E[x^2] - E[x]^2 of float32 whites would lose four digits to cancellation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SsimWindow:
+    """size: pixels a side, odd. sigma: standard deviation of the weights in pixels; None: all equal. sample: covariances over
+    N - 1 instead of N.
+    """
+
+    size: int = 11
+    sigma: float | None = 1.5
+    sample: bool = True
+
+    @property
+    def weights(self) -> np.ndarray:
+        """The normalised window along one axis, (size,) float64."""
+        if self.sigma is None:
+            return np.full(self.size, 1 / self.size)
+        weights = np.exp(-0.5 * ((np.arange(self.size) - self.size // 2) / self.sigma) ** 2)
+        return weights / weights.sum()
+
+    @property
+    def covariance_factor(self) -> float:
+        """Of the windowed mean of products."""
+        return self.size**2 / (self.size**2 - 1) if self.sample else 1.0
+
+
+GAUSSIAN = SsimWindow()
+UNIFORM = SsimWindow(7, None)
+TORCHMETRICS = SsimWindow(sample=False)
+
+
+def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
+    height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
+    rows = jnp.asarray(sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights)))
+    return jnp.asarray(sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(window.weights)))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Array, "*b y x c"]:
+    """The windowed mean around every pixel whose window lies inside the image: (h - size + 1, w - size + 1).
+
+    Raises: ValueError for an image smaller than the window.
+    """
+    if min(x.shape[-3:-1]) < window.size:
+        raise ValueError(f"an image of {x.shape[-2]} x {x.shape[-3]} has no {window.size} x {window.size} window")
+    return _windowed(x, window)
+
+
+def _blur_transposed(window: SsimWindow, _: None, gradient: Float[Array, "*b y x c"]) -> tuple[Float[Array, "*b h w c"]]:
+    # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
+    # pad and add once per slice, which takes four times as long
+    margin = (window.size - 1, window.size - 1)
+    return (_windowed(jnp.pad(gradient, [(0, 0)] * (gradient.ndim - 3) + [margin, margin, (0, 0)]), window),)
+
+
+blur.defvjp(lambda x, window: (blur(x, window), None), _blur_transposed)
+
+
+def similarity_map(
+    predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], window: SsimWindow = GAUSSIAN
+) -> Float[Array, "y x c"]:
+    """SSIM per pixel and channel, (h - size + 1, w - size + 1, c); 1 where the images agree."""
+    x, y = predicted - MIDDLE, target - MIDDLE
+    moments = blur(jnp.concatenate([x, y, x * x, y * y, x * y], axis=-1), window)
+    mean_x, mean_y, square_x, square_y, product = jnp.split(moments, 5, axis=-1)
+    variances = window.covariance_factor * (square_x + square_y - mean_x * mean_x - mean_y * mean_y)
+    covariance = window.covariance_factor * (product - mean_x * mean_y)
+    mean_x, mean_y = mean_x + MIDDLE, mean_y + MIDDLE
+    luminance = (2 * mean_x * mean_y + STABILIZERS[0]) / (mean_x * mean_x + mean_y * mean_y + STABILIZERS[0])
+    return luminance * (2 * covariance + STABILIZERS[1]) / (variances + STABILIZERS[1])
+
+
+def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"]) -> Scalar:
+    """Mean of the first count[0] rows and count[1] columns of a similarity map: of an image that was padded below and right."""
+    inside = [jnp.arange(side) < n for side, n in zip(similarities.shape[:2], count, strict=True)]
+    counted = jnp.where(inside[0][:, None] & inside[1], jnp.mean(similarities, axis=-1), 0.0)
+    # rows first: one float32 sum over a million values would lose digits
+    return jnp.sum(jnp.sum(counted, axis=1) / count[1]) / count[0]
+
+
+def structural_dissimilarity(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
+    """(1 - SSIM) / 2 per pixel and channel, between 0 (the same) and 1 (the inverse)."""
+    return 0.5 * (1 - similarity_map(predicted, target))
+
+
+def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
+    """The image at half the size, box-averaged; an odd last row or column is left out."""
+    height, width, channels = image.shape
+    even = image[: height // 2 * 2, : width // 2 * 2]
+    return even.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3))
+
+
+def multiscale_structural_dissimilarity(
+    predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], scales: int = 3
+) -> Scalar:
+    """Mean structural dissimilarity over `scales` box-halved sizes of the images, weighing each size the same.
+
+    Raises: ValueError where the smallest size has no whole window (it needs 11 pixels a side).
+    """
+    total = jnp.mean(structural_dissimilarity(predicted, target))
+    for _ in range(scales - 1):
+        predicted, target = halve(predicted), halve(target)
+        total += jnp.mean(structural_dissimilarity(predicted, target))
+    return total / scales

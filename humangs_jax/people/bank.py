@@ -25,9 +25,8 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.io.arrays import check_array, check_indices, check_joints
+from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading, write_json
 from humangs_jax.people.anatomy import HEAD, joint_positions
 from humangs_jax.people.poses import sample_rotations

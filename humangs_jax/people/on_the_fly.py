@@ -30,11 +30,11 @@ from humangs_jax.data.loading.examples import SUBJECT_STREAM, Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people import cameras, shading
+from humangs_jax.people import surroundings
 from humangs_jax.people.anatomy import MIRROR
 from humangs_jax.people.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
-from humangs_jax.people.cameras import pick
 from humangs_jax.people.subject import SPLITS, subject_key
+from humangs_jax.people.surroundings import pick
 from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
@@ -60,9 +60,9 @@ class OnTheFlyConfig:
     mixed_pose_share: Share = 0.3
     """Of examples whose inputs show any of the poses too, each; otherwise all show the first."""
     jitter: Spread = 0.7
-    """See `cameras.azimuths_from`."""
+    """See `surroundings.azimuths_from`."""
     scattered_share: Share = 0.2
-    """See `cameras.azimuths_from`."""
+    """See `surroundings.azimuths_from`."""
     close_share: Share = 0.2
     """Of close cameras among the targets."""
     mirrored_share: Share = 0.5
@@ -97,7 +97,7 @@ class Scene:
     vertices: Float[Array, "o n 3"]
     corners: Float[Array, "o f 15"]
     dyes: Float[Array, "m 3 3"]
-    lights: shading.Lights
+    lights: surroundings.Lights
 
 
 def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
@@ -119,11 +119,11 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
 
 def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[str, Float[Array, "..."]]:
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
-    shapes = {"person": (), "poses": (config.poses, 2), "lights": (shading.LIGHT_NUMBERS,), "dyed": ()}
+    shapes = {"person": (), "poses": (config.poses, 2), "lights": (surroundings.LIGHT_NUMBERS,), "dyed": ()}
     shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
     for name, count in (("input", config.input_views), ("target", config.target_views)):
         shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
-        shapes |= {f"{name}_cameras": (count, cameras.CAMERA_NUMBERS)}
+        shapes |= {f"{name}_cameras": (count, surroundings.CAMERA_NUMBERS)}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
     return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
@@ -136,13 +136,13 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConf
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
     poses, nearest = bank.rotations[person, which], bank.rotations[person, bank.nearest[person, which]]
     rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
-    dyes = shading.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    dyes = surroundings.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
     dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
-    lights = shading.lights_from(numbers["lights"])
+    lights = surroundings.lights_from(numbers["lights"])
 
     def pose(rotations):
         vertices, normals, translation = pose_person(bank, person, rotations)
-        openness, lit = shading.shaded_vertices(vertices, normals, lights.directions[0], faces)
+        openness, lit = surroundings.shaded_vertices(vertices, normals, lights.directions[0], faces)
         values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
         return vertices, translation, values[faces].reshape(faces.shape[0], 15)
 
@@ -170,10 +170,10 @@ def pose_person(
 
 def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig) -> tuple[Plan, Plan]:
     """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,)."""
-    azimuths = cameras.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
+    azimuths = surroundings.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
     own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
-    anywhere = cameras.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
+    anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
     close = jnp.full(config.target_views, config.close_share)
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
     return inputs, (numbers["target_cameras"], anywhere, other, close)
@@ -184,7 +184,7 @@ def _views(bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, s
 
     def view(plan):
         u, azimuth, pose, close_share = plan
-        camera = cameras.camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
+        camera = surroundings.camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
         return *draw_view(bank, scene, pose, camera, config), camera
 
     poses = plan[2]
@@ -210,7 +210,7 @@ def draw_view(
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
-    behind = shading.seen_from_behind(vertices, faces, camera.center)
+    behind = surroundings.seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
     z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera, s)[..., 0]
@@ -266,7 +266,7 @@ def _color_points(
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
     slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
     albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
-    return shading.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
+    return surroundings.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
 def _sample(texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]) -> Float[Array, "p 6"]:

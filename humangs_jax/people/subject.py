@@ -18,7 +18,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people import complexion, hair, shading, wardrobe
+from humangs_jax.people import complexion, hair, surroundings, wardrobe
 from humangs_jax.people.anatomy import (
     BODY_NAME,
     BODY_VERTICES,
@@ -34,8 +34,8 @@ from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material, Spots
 from humangs_jax.people.hair import Haircut, sample_haircut
 from humangs_jax.people.outfits import Garment, sample_outfit
-from humangs_jax.people.shading import Lights, sample_lights
 from humangs_jax.people.surfaces import Faces, Field, Folds, Points, Surface, compact, join, vertex_normals
+from humangs_jax.people.surroundings import Lights, sample_lights
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 # Seeds ----------------------------------------------------------------------------------------------------------------
@@ -283,8 +283,8 @@ VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
-_shaded_vertices, _seen_from_behind = jax.jit(shading.shaded_vertices), jax.jit(shading.seen_from_behind)
-_light_points = jax.jit(shading.light_points)
+_shaded_vertices, _seen_from_behind = jax.jit(surroundings.shaded_vertices), jax.jit(surroundings.seen_from_behind)
+_light_points = jax.jit(surroundings.light_points)
 Image = Float[np.ndarray, "h w 3"]
 Map = Float[np.ndarray, "h w"]
 Ids = Int[np.ndarray, " m"]

@@ -29,7 +29,6 @@ from humangs_jax.data.sets import DATA_SET, MANIFEST, SYNTHETIC, begin_set, fini
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.bank import export_scan
-from humangs_jax.people.cameras import Angles, cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import (
@@ -43,6 +42,7 @@ from humangs_jax.people.subject import (
     split_of,
 )
 from humangs_jax.people.surfaces import Points
+from humangs_jax.people.surroundings import Angles, cameras_around, close_cameras, spread_azimuths
 
 HELD_OUT = "held_out"
 """Sub-folder of a subject's folder."""

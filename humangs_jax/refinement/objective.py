@@ -21,7 +21,7 @@ from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.losses.metrics import decibels, structural_dissimilarity
+from humangs_jax.losses.losses import decibels, structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.photos import Photo
 from humangs_jax.rendering.gaussians import Gaussians, UnconstrainedGaussians, constrain, unconstrain, widened

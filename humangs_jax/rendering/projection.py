@@ -32,8 +32,7 @@ from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.gaussians import Gaussians, added_variance
-from humangs_jax.rendering.harmonics import added_colors
+from humangs_jax.rendering.gaussians import Gaussians, added_colors, added_variance
 from humangs_jax.rendering.splat_config import (
     DEFAULT_CONFIG,
     LARGEST_FOOTPRINT,

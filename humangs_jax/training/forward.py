@@ -21,8 +21,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example, ViewSampling
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.losses.losses import ray_spread
-from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent, similarity_map
+from humangs_jax.losses.losses import masked_psnr, psnr, ray_spread, semi_transparent, similarity_map
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, part_variables

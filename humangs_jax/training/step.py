@@ -16,8 +16,7 @@ from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
-from humangs_jax.losses.losses import loss_terms
-from humangs_jax.losses.metrics import psnr
+from humangs_jax.losses.losses import loss_terms, psnr
 from humangs_jax.network.parts import stage
 from humangs_jax.training import sharding
 from humangs_jax.training.augmentation import augment

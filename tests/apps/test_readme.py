@@ -17,7 +17,7 @@ import humangs_jax as hg
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import shape_body
 from humangs_jax.data.capture import save_capture
-from humangs_jax.viewer.live import LiveView
+from humangs_jax.viewer.page import LiveView
 
 ROOT = Path(__file__).parents[2]
 LEAST_PSNR = {256: 25.0, 512: 25.7}

@@ -9,7 +9,7 @@ from small import small_avatar
 
 from humangs_jax.avatar.animate import animate, skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.ply import write_ply
+from humangs_jax.avatar.export.splats import write_ply
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.io.reading import FileError

@@ -19,12 +19,17 @@ from small import random_gaussians
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, ExportFormat, chosen_format
-from humangs_jax.avatar.export.files import export, frame_range
-from humangs_jax.avatar.export.gaussians import BACKWARDS, SH_C0, grounded_gaussians, load_gaussians, rotated, turned
-from humangs_jax.avatar.export.glb import write_glb
-from humangs_jax.avatar.export.ply import write_ply
-from humangs_jax.avatar.export.splat import write_splat
-from humangs_jax.avatar.export.spz import write_spz
+from humangs_jax.avatar.export.gaussians import (
+    BACKWARDS,
+    SH_C0,
+    export,
+    frame_range,
+    grounded_gaussians,
+    load_gaussians,
+    rotated,
+    turned,
+)
+from humangs_jax.avatar.export.splats import write_glb, write_ply, write_splat, write_spz
 from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import mesh as mesh_export
-from humangs_jax.avatar.export.glb import write_glb
 from humangs_jax.avatar.export.mesh import BodyMesh, body_mesh, skin_colors, strongest, vertex_weights, write_mesh_glb
+from humangs_jax.avatar.export.splats import write_glb
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.pytree import replace

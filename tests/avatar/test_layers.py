@@ -9,7 +9,7 @@ from exr_files import read_exr
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar import frames, layers
-from humangs_jax.avatar.light import surface_normals
+from humangs_jax.avatar.avatar import surface_normals
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace

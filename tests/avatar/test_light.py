@@ -8,8 +8,7 @@ from avatar_cases import two_balls
 from changes import edit_npz
 
 from humangs_jax.avatar.animate import animate, skin
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import LIMIT, Light, light_terms, relit, surface_normals, turned_normals
+from humangs_jax.avatar.avatar import LIMIT, Avatar, Light, light_terms, relit, surface_normals, turned_normals
 from humangs_jax.avatar.reconstruct import with_light
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from humangs_jax.avatar.sheets import ERROR_COLORS, GAP, contact_sheet, error_colors, side_by_side, tile, write_texts
+from humangs_jax.avatar.video import ERROR_COLORS, GAP, contact_sheet, error_colors, side_by_side, tile, write_texts
 from humangs_jax.io.images import read_image, to_uint8, write_png
 
 LEVEL = 0.5 / 255 + 1e-6

@@ -9,8 +9,8 @@ import pytest
 
 import humangs_jax as hg
 from humangs_jax import cli
+from humangs_jax.avatar.frames import circle_cameras, file_cameras
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.avatar.splat_views import circle_cameras, file_cameras
 from humangs_jax.io.images import read_image
 
 STEP = 0.51 / 255

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import humangs_jax as hg
-from humangs_jax.avatar.export.ply import write_ply
+from humangs_jax.avatar.export.splats import write_ply
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
 from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, POSITIVE, UNIT, check_values, checked_arguments

@@ -16,8 +16,7 @@ from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.displacement import HELD_JOINTS, INWARDS, OUTWARDS, WRAP, displacement
 from humangs_jax.data.views import subject_rest
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 SIZE, COAT = 384, 0.01
 FOUND = 0.003

@@ -18,7 +18,7 @@ from humangs_jax.evaluation.scores import (
     WholeFrame,
     find_protocol,
 )
-from humangs_jax.losses.metrics import GAUSSIAN, TORCHMETRICS, UNIFORM
+from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM
 
 
 def blob(seed, height, width):

@@ -12,7 +12,7 @@ from skimage.metrics import structural_similarity
 
 from humangs_jax.evaluation import scores
 from humangs_jax.evaluation.scores import PROTOCOLS, CentredWindow
-from humangs_jax.losses.metrics import GAUSSIAN, TORCHMETRICS, UNIFORM, boundary_psnr, mean_similarity, similarity_map
+from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM, boundary_psnr, mean_similarity, similarity_map
 from humangs_jax.losses.perceptual import lpips
 
 DECIBELS = 1e-4

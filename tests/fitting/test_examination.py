@@ -7,7 +7,7 @@ from seen_people import NOISE, body, person
 
 from humangs_jax.apps import check as module
 from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet, plot_over_time
-from humangs_jax.avatar.sheets import GAP
+from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture

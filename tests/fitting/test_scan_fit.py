@@ -41,9 +41,9 @@ from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, s
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.state import pose_prior
 from humangs_jax.geometry.camera import project
+from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.mesh import GREY
-from humangs_jax.io.npz import read_npz
-from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))

@@ -43,8 +43,8 @@ from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import read_fit_record
 from humangs_jax.fitting.scan_files import read_joints, read_mesh, read_placement
+from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
-from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors

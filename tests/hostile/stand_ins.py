@@ -39,7 +39,7 @@ from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.npz import write_npz
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 from humangs_jax.people.bank import PeopleBank

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from exr_files import camera_of, read_exr
 
+from humangs_jax.avatar.layers import ExrView, write_exr
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.io.exr import ExrView, write_exr
 
 HEIGHT, WIDTH = 13, 9  # odd and unequal: a transposed or strided write cannot pass
 

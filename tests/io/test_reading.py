@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.io import reading as module
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.reading import (
     FileError,
     Limits,

@@ -5,8 +5,21 @@ import numpy as np
 import pytest
 from rounding import bound
 
-from humangs_jax.losses.losses import FAR_SURFACE, ray_spread, squared_error, surface_distance, tightness, translucency
-from humangs_jax.losses.metrics import BOUNDARY, LARGEST_PSNR, boundary_psnr, masked_psnr, psnr, semi_transparent, silhouette_iou
+from humangs_jax.losses.losses import (
+    BOUNDARY,
+    FAR_SURFACE,
+    LARGEST_PSNR,
+    boundary_psnr,
+    masked_psnr,
+    psnr,
+    ray_spread,
+    semi_transparent,
+    silhouette_iou,
+    squared_error,
+    surface_distance,
+    tightness,
+    translucency,
+)
 
 SIDE = 256
 FLOAT32 = 1e-6

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rounding import bound
 from skimage.metrics import structural_similarity
 
-from humangs_jax.losses.metrics import (
+from humangs_jax.losses.losses import (
     GAUSSIAN,
     blur,
     halve,

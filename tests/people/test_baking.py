@@ -10,7 +10,7 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.people import bank, cameras, subject, writer
+from humangs_jax.people import bank, subject, surroundings, writer
 from humangs_jax.people.subject import DEMO
 from humangs_jax.rendering.mesh import atlas, rasterizer
 from humangs_jax.rendering.mesh.rasterizer import sample_texture
@@ -148,7 +148,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
         texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[..., :3]
         np.testing.assert_array_equal(texture, bank.lit_texture(posed, baked))
         textures.append(texture)
-    camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
+    camera = surroundings.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
     direct, mask = subject.render_view(posed, camera)
     faces, uvs = jnp.asarray(mesh.faces, jnp.int32), jnp.asarray(mesh.visual.uv, jnp.float32)
     vertices, texture = jnp.asarray(mesh.vertices, jnp.float32), jnp.asarray(textures[0] / 255, jnp.float32)

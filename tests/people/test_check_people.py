@@ -8,7 +8,7 @@ import pytest
 from experiments import generator as check_people
 from experiments.generator import people_sheets
 from experiments.harness import call
-from humangs_jax.people import cameras
+from humangs_jax.people import surroundings
 from humangs_jax.people.subject import DEMO, make_subject
 from humangs_jax.people.writer import sample_pose
 
@@ -22,7 +22,9 @@ def posed(body):
 
 @pytest.fixture(scope="module")
 def camera(posed):
-    return cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([posed.rotations[0, 1]], float), SIZE)[0]
+    return surroundings.cameras_around(
+        np.random.default_rng(0), posed.vertices, np.asarray([posed.rotations[0, 1]], float), SIZE
+    )[0]
 
 
 def faults(body, posed, camera):

@@ -16,7 +16,7 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.presets import tiny
-from humangs_jax.people import cameras, on_the_fly, shading, subject
+from humangs_jax.people import on_the_fly, subject, surroundings
 from humangs_jax.people.anatomy import joint_positions
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
@@ -37,8 +37,8 @@ LIKE_RENDERED = 30
 
 
 draw_view, rasterize = jax.jit(on_the_fly.draw_view), jax.jit(rasterize_mesh)
-camera_from = jax.jit(cameras.camera_from, static_argnames="size")
-between, dyes = jax.jit(quaternion.interpolate), jax.jit(shading.dyes_from)
+camera_from = jax.jit(surroundings.camera_from, static_argnames="size")
+between, dyes = jax.jit(quaternion.interpolate), jax.jit(surroundings.dyes_from)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_processes_make_the_same_bank(bank, body):
 
 def test_keys_choose_among_the_people_of_the_bank(bank):
     draw = jax.jit(jax.vmap(lambda key: on_the_fly._draw_numbers(bank, key, CONFIG)["person"]))
-    people = np.asarray(cameras.pick(draw(jax.random.split(jax.random.key(0), 200)), bank.people))
+    people = np.asarray(surroundings.pick(draw(jax.random.split(jax.random.key(0), 200)), bank.people))
     assert set(people.tolist()) == set(range(len(SEEDS)))
     np.testing.assert_array_equal(bank.seeds, SEEDS)
 
@@ -273,7 +273,7 @@ def test_poses_stand_on_the_ground_between_two_of_the_prior(bank, scene):
 
 def test_cameras_see_all_of_the_person_or_keep_clear_of_it(bank, scene):
     vertices = np.asarray(scene.vertices[0])
-    center, radius = cameras.bounding_sphere(vertices)
+    center, radius = surroundings.bounding_sphere(vertices)
     close = []
     for seed in range(8):
         camera = draw(scene, bank, seed, 0.0, SIZE)
@@ -296,7 +296,7 @@ def test_dyes_leave_skin_alone_and_pieces_of_one_cloth_alike():
     assert np.abs(matrices[4] - matrices[2]).max() > 0.05
     grey = matrices @ np.ones(3)
     np.testing.assert_allclose(grey - grey[:, :1], 0, atol=1e-6)  # grey stays grey
-    lights = jax.jit(shading.lights_from)(np.random.default_rng(0).random(shading.LIGHT_NUMBERS, np.float32))
+    lights = jax.jit(surroundings.lights_from)(np.random.default_rng(0).random(surroundings.LIGHT_NUMBERS, np.float32))
     np.testing.assert_allclose(np.linalg.norm(lights.directions, axis=1), 1, atol=1e-6)
 
 
@@ -308,20 +308,20 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
     corners = np.asarray(scene.corners[0]).reshape(-1, 5)
     normals = np.zeros_like(vertices)
     normals[np.asarray(faces).reshape(-1)] = corners[:, :3]
-    shaded = jax.jit(shading.shaded_vertices)
+    shaded = jax.jit(surroundings.shaded_vertices)
     openness, exact = (np.asarray(x) for x in shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0])))
-    low = vertices.min(0) - np.float32(shading.MARGIN * shading.CELL)
-    grid = np.zeros(shading.GRID)
-    grid[tuple(((vertices - low) / np.float32(shading.CELL)).astype(int).T)] = 1
+    low = vertices.min(0) - np.float32(scene.MARGIN * scene.CELL)
+    grid = np.zeros(scene.GRID)
+    grid[tuple(((vertices - low) / np.float32(scene.CELL)).astype(int).T)] = 1
     grid = uniform_filter(uniform_filter(grid, 3, mode="constant"), 3, mode="constant")
-    at = [(vertices + reach * normals - low) / shading.CELL - 0.5 for reach in shading.REACH]
+    at = [(vertices + reach * normals - low) / scene.CELL - 0.5 for reach in scene.REACH]
     dark = np.mean([map_coordinates(grid, points.T, order=1) for points in at], axis=0)
     expected = np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
     assert np.mean(np.abs(openness - expected) > 1e-4) < 0.01  # a vertex on the edge of a voxel may mark the next one
     used = np.unique(np.asarray(faces))
     for arriving in (exact, np.asarray(shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0]), faces)[1])):
         lit = arriving[used]
-        assert lit.min() >= shading.DARKEST and lit.max() <= 1
+        assert lit.min() >= scene.DARKEST and lit.max() <= 1
         high, low_down = vertices[used, 1] > vertices[:, 1].max() - 0.03, vertices[used, 1] < 0.05
         assert lit[high].mean() > lit[low_down].mean() + 0.15  # from above: the head is lit, the feet are not
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.people import outfits, shading, subject
+from humangs_jax.people import outfits, subject, surroundings
 from humangs_jax.people.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
 from humangs_jax.people.fabrics import Material, Spots
 from humangs_jax.people.hair import BEARDS, CUTS
@@ -135,27 +135,27 @@ def test_shadows_fall_away_from_the_light():
     vertices = np.concatenate([floor, roof]).astype(np.float32)
     normals = np.tile(np.asarray([0, 1, 0], np.float32), (len(vertices), 1))
     up = jnp.asarray([0.0, 1.0, 0.0])
-    lit = np.asarray(shading.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), up)[1])
+    lit = np.asarray(surroundings.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), up)[1])
     below = np.linalg.norm(floor, axis=1) < 0.1
     assert lit[: len(floor)][below].max() < 0.75 < 0.95 < lit[: len(floor)][np.abs(floor[:, 0]) > 0.37].min()
     assert lit[len(floor) :].min() > 0.95  # nothing above the roof
-    assert lit.min() >= shading.DARKEST
+    assert lit.min() >= scene.DARKEST
 
 
 def test_exposure_and_white_balance_scale_the_picture():
-    lights = shading.sample_lights(np.random.default_rng(0))
+    lights = surroundings.sample_lights(np.random.default_rng(0))
     plain = replace(lights, gain=jnp.ones(3))
     warm = replace(lights, gain=jnp.asarray([1.2, 1.0, 0.8]))
     point = jnp.full((1, 3), 0.2), jnp.asarray([[0.0, 0.0, 1.0]]), jnp.ones(1), jnp.ones(1), jnp.zeros(1)
-    ratio = shading.shade(warm, *point) / shading.shade(plain, *point)
+    ratio = surroundings.shade(warm, *point) / surroundings.shade(plain, *point)
     np.testing.assert_allclose(ratio, [[1.2, 1.0, 0.8]], rtol=1e-5)
 
 
 def test_highlights_are_bent_not_cut():
     bright = np.linspace(0, 3, 200, dtype=np.float32)[:, None] * np.ones(3, np.float32)
-    bent = np.asarray(shading.rolled_off(jnp.asarray(bright)))
-    np.testing.assert_allclose(bent[bright < shading.SHOULDER], bright[bright < shading.SHOULDER])
-    assert (np.diff(bent, axis=0) > 0).all() and bent.max() < shading.WHITEST
+    bent = np.asarray(surroundings.rolled_off(jnp.asarray(bright)))
+    np.testing.assert_allclose(bent[bright < surroundings.SHOULDER], bright[bright < surroundings.SHOULDER])
+    assert (np.diff(bent, axis=0) > 0).all() and bent.max() < scene.WHITEST
 
 
 def test_fabrics_of_one_seed_are_one_fabric():

@@ -6,7 +6,7 @@ import pytest
 
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people import cameras, fabrics, subject, writer
+from humangs_jax.people import fabrics, subject, surroundings, writer
 from humangs_jax.people.anatomy import LEFT_HIP, LEFT_KNEE
 from humangs_jax.people.fabrics import PATTERNS
 from humangs_jax.people.subject import DEMO
@@ -37,7 +37,7 @@ def views(posed):
     result = []
     for i, p in enumerate(posed):
         rng = np.random.default_rng(i)
-        batch = cameras.cameras_around(rng, p.vertices, cameras.spread_azimuths(rng, 3), SIZE)
+        batch = surroundings.cameras_around(rng, p.vertices, surroundings.spread_azimuths(rng, 3), SIZE)
         images, masks = zip(*(subject.render_view(p, batch[k]) for k in range(3)), strict=True)
         result.append((batch, np.stack(images), np.stack(masks)))
     return result
@@ -105,7 +105,7 @@ def test_cloth_covers_and_leaves_the_body(body, people, posed):
         pose = BodyPose(jax.numpy.asarray(p.rotations), jax.numpy.asarray(p.translation))
         naked = pose_body(body, rest, pose)
         rng = np.random.default_rng(0)
-        camera = cameras.cameras_around(rng, p.vertices, np.asarray([0.4]), SIZE)[0]
+        camera = surroundings.cameras_around(rng, p.vertices, np.asarray([0.4]), SIZE)[0]
         skin = np.asarray(rasterize_mesh(naked.vertices, body.faces, camera).face_ids) >= 0
         fragments = rasterize_mesh(*subject.padded(p.vertices, person.surface.faces), camera)
         ids = np.asarray(fragments.face_ids)
@@ -165,7 +165,7 @@ def test_the_whole_person_is_in_the_frame(views):
 
 def test_cameras_follow_the_protocol(posed, views):
     for p, (batch, _, _) in zip(posed, views, strict=True):
-        center, radius = cameras.bounding_sphere(p.vertices)
+        center, radius = surroundings.bounding_sphere(p.vertices)
         offset = np.asarray(batch.center) - center
         distance = np.linalg.norm(offset, axis=1)
         assert (distance >= 1.8 * radius - 1e-4).all() and (distance < 2.7 * radius).all()

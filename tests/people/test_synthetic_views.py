@@ -16,7 +16,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.people import cameras, writer
+from humangs_jax.people import surroundings, writer
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.subject import DEMO, GENERATOR_VERSION, SPLITS, seeds_of, split_of
 from humangs_jax.people.writer import find_people
@@ -72,8 +72,8 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
 def test_close_cameras_are_close_and_outside(seed):
     rng = np.random.default_rng(seed)
     vertices = rng.normal(size=(300, 3)) * [0.2, 0.5, 0.15] + [0.0, 0.9, 0.0]
-    batch = cameras.close_cameras(rng, vertices, cameras.spread_azimuths(rng, 6), 64)
-    center, radius = cameras.bounding_sphere(vertices)
+    batch = surroundings.close_cameras(rng, vertices, surroundings.spread_azimuths(rng, 6), 64)
+    center, radius = surroundings.bounding_sphere(vertices)
     eyes = np.asarray(batch.center)
     nearest = np.linalg.norm(eyes[:, None] - vertices[None], axis=-1).min(1)
     assert (nearest > cameras.CLEARANCE - 1e-4).all()

@@ -12,7 +12,8 @@ from splat_scenes import camera, random_gaussians, with_harmonics
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import stack_cameras
-from humangs_jax.rendering import harmonics, reference
+from humangs_jax.rendering import gaussians as harmonics
+from humangs_jax.rendering import reference
 from humangs_jax.rendering.gaussians import constrain, skin_gaussians, unconstrain
 from humangs_jax.rendering.projection import project_gaussians as project
 from humangs_jax.rendering.reference import render_reference

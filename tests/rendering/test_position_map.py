@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.geometry.camera import Camera, orbit, project
-from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map, vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import gouraud_position_map, plain_position_map, rasterize_mesh, vertex_normals
 
 STORED_AS_FLOAT16 = 5e-4
 """Half of float16's spacing below 1."""

@@ -14,7 +14,7 @@ from small import small_avatar
 from experiments import chromium
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.viewer import live
+from humangs_jax.viewer import page as live
 from humangs_jax.viewer.page import page_html
 
 
@@ -53,11 +53,11 @@ def test_the_weights_of_a_run_reconstruct_someone(tmp_path, monkeypatch):
     monkeypatch.setattr(live, "load_weights", lambda file: (file, "config"))
     monkeypatch.setattr(live, "reconstruct", lambda *arguments: calls.append(arguments) or avatar)
     view = Shown()
-    (tmp_path / live.WEIGHTS).write_bytes(b"1")
+    (tmp_path / live.RUN_WEIGHTS).write_bytes(b"1")
     shown = live.show_newest(view, tmp_path, photos, None)
     shown = live.show_newest(view, tmp_path, photos, shown)
-    assert calls == [(tmp_path / live.WEIGHTS, "config", photos)] and view.avatars == [avatar]
-    (tmp_path / live.WEIGHTS).write_bytes(b"22")
+    assert calls == [(tmp_path / live.RUN_WEIGHTS, "config", photos)] and view.avatars == [avatar]
+    (tmp_path / live.RUN_WEIGHTS).write_bytes(b"22")
     live.show_newest(view, tmp_path, photos, shown)
     assert len(calls) == 2
 
@@ -79,7 +79,7 @@ def test_what_cannot_be_followed_is_named(tmp_path, name, capture, message):
 
 def test_the_network_writes_where_the_viewer_looks():
     loop = Path(live.__file__).parents[1] / "training" / "loop.py"
-    assert f'save_weights(out / "{live.WEIGHTS}"' in loop.read_text()
+    assert f'save_weights(out / "{live.RUN_WEIGHTS}"' in loop.read_text()
 
 
 @pytest.fixture

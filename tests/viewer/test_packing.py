@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small import small_avatar, small_body
 
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import Light
+from humangs_jax.avatar.avatar import Avatar, Light
 from humangs_jax.body.model import shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion

@@ -1,6 +1,6 @@
 """An avatar in the files that other people's programs open (docs/export.md), and videos of it: the tables of their formats.
 
-`files.export` writes a file, `gaussians.load_gaussians` reads one; `ply`, `splat`, `spz`, `glb` and `mesh` are the formats.
+`gaussians` has what reads and writes, `splats` the formats of Gaussians, `mesh` those of the body.
 """
 
 import dataclasses
@@ -38,20 +38,20 @@ class ExportFormat(Format):
 
 EXPORTS = Formats(
     ply=ExportFormat(
-        *("3DGS", f"{HERE}.ply:write_ply", (".ply",)),
-        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.ply:read_ply", "magic": b"ply"},
+        *("3DGS", f"{HERE}.splats:write_ply", (".ply",)),
+        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.splats:read_ply", "magic": b"ply"},
     ),
     splat=ExportFormat(
-        *("antimatter15's viewer and others", f"{HERE}.splat:write_splat", (".splat",)),
-        **{"up": "-y", "reader": f"{HERE}.splat:read_splat"},
+        *("antimatter15's viewer and others", f"{HERE}.splats:write_splat", (".splat",)),
+        **{"up": "-y", "reader": f"{HERE}.splats:read_splat"},
     ),
     spz=ExportFormat(
-        *("Niantic's, compressed", f"{HERE}.spz:write_spz", (".spz",)),
-        **{"backwards": True, "reader": f"{HERE}.spz:read_spz", "magic": b"\x1f\x8b\x08"},
+        *("Niantic's, compressed", f"{HERE}.splats:write_spz", (".spz",)),
+        **{"backwards": True, "reader": f"{HERE}.splats:read_spz", "magic": b"\x1f\x8b\x08"},
     ),
     glb=ExportFormat(
-        *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.glb:write_glb", (".glb",)),
-        **{"reader": f"{HERE}.glb:read_glb", "magic": b"glTF"},
+        *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.splats:write_glb", (".glb",)),
+        **{"reader": f"{HERE}.splats:read_glb", "magic": b"glTF"},
     ),
     mesh=ExportFormat(
         *("with --mesh the body with texture, skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),

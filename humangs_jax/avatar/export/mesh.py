@@ -33,7 +33,7 @@ from humangs_jax.io.atomic import write_text
 from humangs_jax.io.images import write_png
 from humangs_jax.io.mesh import INDICES, VERTICES, GlbWriter
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
-from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TEXTURE_SIZE = 1024
 """Texels a side: some 2 mm on an adult. Gaussians are 5 to 10 mm apart."""

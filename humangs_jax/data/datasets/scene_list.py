@@ -22,8 +22,8 @@ from humangs_jax.data.capture_checks import CaptureError, checked_camera, checke
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, checked_numbers, open_arrays, recover_pose, recover_shape
 from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
 from humangs_jax.data.photos import read_checked
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_grey, read_image
-from humangs_jax.io.npz import write_npz
 from humangs_jax.io.reading import inside, reading, shown, write_json
 
 LISTS = ("train.json", "test.json")

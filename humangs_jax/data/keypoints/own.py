@@ -24,8 +24,7 @@ from humangs_jax.data.formats import SourceFormat
 from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Keypoints, Source
 from humangs_jax.data.keypoints.sets import KEYPOINT_SETS, MEDIAPIPE_33, KeypointSet
 from humangs_jax.detection.people import DetectedPerson
-from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.npz import write_npz
+from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.reading import check_limit, write_json
 
 FORMAT, VERSION = "humangs-people", 1

@@ -21,7 +21,7 @@ from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.formats import DEFAULT_FPS, MOTIONS, MotionFormat
 from humangs_jax.data.motion import rules, skeleton
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.io.npz import write_npz
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.reading import FileError, check_limit, open_file, reading
 
 logger = logging.getLogger(__name__)

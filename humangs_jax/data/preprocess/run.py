@@ -63,9 +63,9 @@ from humangs_jax.data.preprocess.protocol import (
     video_alignment,
 )
 from humangs_jax.data.sets import DATA_SET, begin_set, finished, made, write_manifest
+from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
-from humangs_jax.io.npz import write_npz
 from humangs_jax.io.reading import write_json
 
 SKIPPED = "skipped"

@@ -35,7 +35,7 @@ from humangs_jax.fitting.state import (
     usual_origin,
 )
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 VERTICES = 7000
 """Evenly spread, nearly all visible from outside: 1.6 cm apart."""

@@ -25,8 +25,7 @@ from humangs_jax.fitting.solve import robust
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.maps import sample_bilinear
-from humangs_jax.rendering.mesh.position_map import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 PROBE = 1.5
 """Pixels outside of a silhouette at which there must be no body."""

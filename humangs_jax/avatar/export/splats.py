@@ -1,0 +1,449 @@
+"""Formats of Gaussians: `.ply`, `.splat`, `.spz` and `.glb`.
+
+`.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
+
+3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb - 1/2) / Y00, f_rest_* of
+degrees 1 to 3 (all of red, then of green, then of blue), logit opacity, log scales, quaternion wxyz.
+
+Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk with the bounds of positions, log
+scales and perhaps colors; for each Gaussian four words: position and scale between them in 11, 10 and 11 bits, the quaternion
+without its largest component in 2 bits and three times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
+"""
+
+import gzip
+import io
+import itertools
+import logging
+import os
+import re
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import expit
+
+from humangs_jax.avatar.export.gaussians import colors_of, linear_of, loaded, plain_arrays, sh_of, with_largest
+from humangs_jax.core.array_types import Float, UInt, UInt8
+from humangs_jax.core.checks import checked_arguments
+from humangs_jax.data.motion.gltf import node_matrices
+from humangs_jax.io.atomic import replace_file, write_bytes
+from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, shown
+from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
+
+OPACITY_MARGIN = 1e-6
+"""Keeps the logit finite for opacities of 0 and 1."""
+SMALLEST_SCALE = 1e-9
+"""Metres; keeps the logarithm finite for flat Gaussians."""
+LONGEST_HEADER = 1 << 16
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+}
+TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
+CHUNK = 256
+REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
+"""Of the bytes of compressed harmonics: the middle of each step, the ends of the first and last."""
+Columns = Mapping[str, np.ndarray]
+
+
+@checked_arguments
+def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: bool = False) -> None:
+    """Write a 3DGS `.ply`; the file appears whole or not at all.
+
+    rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there are no such harmonics.
+    """
+    import plyfile
+
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    p = np.clip(opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    columns = dict(zip("xyz", means.T, strict=True))
+    columns |= {f"n{axis}": np.zeros(len(means)) for axis in "xyz"}
+    columns |= {f"f_dc_{i}": sh_of(colors)[:, i] for i in range(3)}
+    if rest_fields:
+        harmonics = np.pad(harmonics, ((0, 0), (0, COUNTS[-1] - harmonics.shape[1]), (0, 0)))
+    rest = harmonics.swapaxes(1, 2).reshape(len(means), 3 * harmonics.shape[1])
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(rest.T)}
+    columns["opacity"] = np.log(p) - np.log1p(-p)
+    columns |= {f"scale_{i}": np.log(np.maximum(scales[:, i], SMALLEST_SCALE)) for i in range(3)}
+    columns |= {f"rot_{i}": quats[:, i] for i in range(4)}
+    vertices = np.empty(len(means), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values
+    content = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
+    replace_file(path, lambda temporary: content.write(str(temporary)))
+
+
+def read_ply(data: bytes) -> Gaussians:
+    """Gaussians of the bytes of a file. Raises: Refused; what damaged numbers raise."""
+    elements = _elements(data)
+    vertex = elements.get("vertex", {})
+    if "chunk" in elements:
+        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}))
+    arrays = {
+        "x, y, z": _columns(vertex, *"xyz"),
+        "rot_*": _columns(vertex, *(f"rot_{i}" for i in range(4))),
+        "scale_*": _exponential(_columns(vertex, *(f"scale_{i}" for i in range(3)))),
+        "opacity": expit(_columns(vertex, "opacity")[:, 0]),
+        "f_dc_*": colors_of(_columns(vertex, *(f"f_dc_{i}" for i in range(3)))),
+    }
+    return loaded(arrays | _harmonics(vertex))
+
+
+def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
+    return np.exp(np.minimum(logs, 99))  # far too large, so refused
+
+
+def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, Float[np.ndarray, "g k 3"]]:
+    """Under their name, nothing if there are none. values: what the bytes of a column stand for."""
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count % 3 or count // 3 not in COUNTS:
+        raise Refused(f"f_rest_*: expected 9, 24 or 45 properties, got {count}")
+    if not count:
+        return {}
+    rest = _columns(columns, *(f"f_rest_{i}" for i in range(count)), dtype=np.float32 if values is None else np.uint8)
+    rest = rest if values is None else values[rest]
+    return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
+
+
+def _unpacked(chunk: Columns, vertex: Columns, sh: Columns) -> Gaussians:
+    """Gaussians of compressed columns."""
+    words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
+    bits = {name: np.stack([_bits(words[name], *place) for place in places], axis=1) for name, places in WORDS.items()}
+    count, chunks = len(words["color"]), len(next(iter(chunk.values())))
+    if chunks != -(-count // CHUNK):
+        raise Refused(f"chunk: expected one for each {CHUNK} of {count:,} Gaussians, got {chunks:,}")
+
+    def between(part: Float[np.ndarray, "g 3"], *names: str) -> Float[np.ndarray, "g 3"]:
+        low, high = (_columns(chunk, *(f"{end}_{name}" for name in names)) for end in ("min", "max"))
+        return np.repeat(low, CHUNK, axis=0)[:count] * (1 - part) + np.repeat(high, CHUNK, axis=0)[:count] * part
+
+    colors = bits["color"][:, :3]
+    arrays = {
+        "packed_position": between(bits["position"], *"xyz"),
+        "packed_rotation": with_largest((bits["rotation"] - 0.5) * np.sqrt(2), words["rotation"] >> 30),
+        "packed_scale": _exponential(between(bits["scale"], "scale_x", "scale_y", "scale_z")),
+        "opacity": bits["color"][:, 3],
+        "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
+    }
+    return loaded(arrays | _harmonics(sh, REST))
+
+
+_ELEVEN = [(21, 11), (11, 10), (0, 11)]
+WORDS = {
+    "position": _ELEVEN,
+    "rotation": [(20, 10), (10, 10), (0, 10)],
+    "scale": _ELEVEN,
+    "color": [(24, 8), (16, 8), (8, 8), (0, 8)],
+}
+"""Of compressed Gaussians: the lowest bit and the width of each part."""
+
+
+def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]:
+    """From 0 to 1."""
+    return (words >> np.uint32(lowest) & np.uint32(2**width - 1)) / (2**width - 1)
+
+
+def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64) -> np.ndarray:
+    """Properties (g, names) as numbers of a type. Raises: Refused for one that is missing, or not of the bytes it is made of."""
+    for name in names:
+        if name not in columns:
+            raise Refused(f"{name}: missing: expected Gaussians (x, y, z, f_dc_*, opacity, scale_*, rot_* or packed_*)")
+        if issubclass(dtype, np.integer) and columns[name].dtype.newbyteorder("=") != dtype:
+            raise Refused(f"{name}: expected {np.dtype(dtype).name}, got {columns[name].dtype}")
+    with np.errstate(over="ignore"):
+        return np.stack([columns[name].astype(dtype) for name in names], axis=-1)
+
+
+def _elements(data: bytes) -> dict[str, Columns]:
+    """Columns of the elements, up to one with lists. Nothing is made before it is known that the file is long enough."""
+    end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
+    if end is None:
+        raise Refused("no PLY file: expected a header that ends in end_header")
+    order, counts, types = None, {}, {}
+    for line in data[: end.start()].decode("ascii", "replace").splitlines():
+        match line.split():
+            case [] | ["ply"] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", str(form), _] if form in ORDERS:
+                order = ORDERS[form]
+            case ["element", str(name), str(count)] if name not in counts and count.isdecimal() and len(count) < 20:
+                counts[name], types[name] = int(count), []
+            case ["property", "list", _, _, str(name)] if types:
+                list(types.values())[-1].append((name, None))
+            case ["property", str(kind), str(name)] if types and kind in TYPES and order is not None:
+                list(types.values())[-1].append((name, order + TYPES[kind]))
+            case _:
+                raise Refused(f"header: {shown(line)}: not understood")
+    if order is None:
+        raise Refused("header: no format")
+    lines = None
+    if not order:
+        check_limit("text_bytes", len(data), "bytes")
+        lines = io.StringIO(data[end.end() :].decode("ascii"))
+    found, at = {}, end.end()
+    for name, count in counts.items():
+        if any(kind is None for _, kind in types[name]):
+            break
+        check_limit("gaussians", count, f"elements {name}")
+        dtype = np.dtype(types[name])
+        least = dtype.itemsize if lines is None else 2 * len(types[name])  # a digit and a space
+        if not dtype.names or count * least > len(data) - at + (lines is not None):
+            raise Refused(f"element {name}: {count:,} of them are not in {len(data) - at:,} bytes")
+        if lines is None:
+            rows = np.ndarray((count,), dtype, data, at)
+            found[name] = {each: rows[each] for each in dtype.names}
+            at += count * least
+        elif count:
+            rows = np.loadtxt(itertools.islice(lines, count), comments=None, ndmin=2)
+            if rows.shape != (count, len(dtype.names)):
+                raise Refused(f"element {name}: expected {count} lines of {len(dtype.names)} numbers, got {rows.shape}")
+            found[name] = dict(zip(dtype.names, rows.T, strict=True))
+    return found
+
+
+# `.splat` (https://github.com/antimatter15/splat): 32 bytes a Gaussian, position and scales in float32, RGBA and quaternion
+# wxyz in uint8, the largest and most opaque first. It has no header.
+
+
+ROW = [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
+ROW_BYTES = 32
+
+
+def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits, quaternions to 7.
+
+    Raises: ValueError for Gaussians with harmonics.
+    """
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    if harmonics.size:
+        raise ValueError(
+            f"{path}: .splat holds one color for each Gaussian: expected no harmonics (replace(gaussians, harmonics=None))"
+        )
+    rows = np.empty(len(means), ROW)
+    rows["position"], rows["scale"] = means, scales
+    rows["rgba"] = np.rint(255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1))
+    rows["rotation"] = np.clip(np.rint(128 * quats + 128), 0, 255)
+    order = np.argsort(-opacities * scales.prod(axis=1), kind="stable")  # viewers draw the first while the rest loads
+    write_bytes(path, rows[order].tobytes())
+
+
+def read_splat(data: bytes) -> Gaussians:
+    """Gaussians of the bytes of a file. Raises: Refused."""
+    check_limit("gaussians", len(data) // ROW_BYTES, "Gaussians")
+    if not data or len(data) % ROW_BYTES:
+        raise Refused(f"no .splat file: expected {ROW_BYTES} bytes for each Gaussian, got {len(data):,}")
+    rows = np.ndarray((len(data) // ROW_BYTES,), ROW, data)
+    rgba = rows["rgba"] / 255
+    arrays = {
+        "position": rows["position"],
+        "rotation": (rows["rotation"] - 128.0) / 128,
+        "scale": rows["scale"],
+        "opacity": rgba[:, 3],
+        "color": rgba[:, :3],
+    }
+    return loaded(arrays)
+
+
+# `.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): gzip of a header and six arrays, 20 bytes a Gaussian and 3
+# for each harmonic. Positions in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k / 16 - 10)
+# metres, quaternions by their three smallest components in 10 bits each (version 3, which is written) or by x, y, z in a byte
+# each (version 2), harmonics k / 128 - 1, the channels of each together. Libraries that write it bring a compiler (gsply) or do
+# not install (PyPI's spz).
+
+
+SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3
+HEADER = struct.Struct("<IIIBBBB")
+"""Magic, version, number of Gaussians, degree, fractional bits, flags, nothing."""
+MORE_BEHIND = 2
+"""The flag of files with parts that are not read here."""
+MOST_FRACTIONAL_BITS = 20
+"""Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
+COLOR_SCALE, SCALE_STEPS, SCALE_ZERO, HARMONIC_STEPS = 0.15, 16.0, 10.0, 128.0
+QUATERNION_STEPS = 511
+
+
+def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a `.spz`; the file appears whole or not at all.
+
+    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to 10. Harmonics are from -1 to 1.
+
+    Raises: ValueError for Gaussians farther than 8,000 km from the origin.
+    """
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    farthest = np.abs(means).max(initial=1e-6)
+    bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
+    if bits < 0:
+        raise ValueError(f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}")
+    fixed = np.rint(means * 2.0**bits).astype("<i4")
+    with np.errstate(divide="ignore"):
+        steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
+    parts = (
+        fixed[..., None].view("u1")[..., :3],  # the lower three of four bytes
+        _byte(255 * opacities),
+        _byte(255 * (COLOR_SCALE * sh_of(colors) + 0.5)),
+        _byte(steps),
+        _packed_quaternions(quats),
+        _byte(HARMONIC_STEPS * harmonics + HARMONIC_STEPS),
+    )
+    header = HEADER.pack(SPZ_MAGIC, SPZ_VERSION, len(means), COUNTS.index(harmonics.shape[1]), bits, 0, 0)
+    data = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    write_bytes(path, gzip.compress(data, 9, mtime=0))
+
+
+def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
+    return np.clip(np.rint(values), 0, 255).astype("u1")
+
+
+def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
+    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest = np.argmax(np.abs(xyzw), axis=1)
+    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
+    sizes = np.clip(np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS).astype("<u4")
+    packed = largest.astype("<u4")
+    for i in range(4):
+        component = packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
+        packed = np.where(largest == i, packed, component).astype("<u4")
+    return packed
+
+
+def read_spz(data: bytes) -> Gaussians:
+    """Gaussians of the bytes of a file. Raises: Refused; what gzip raises for damaged files."""
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        header = file.read(HEADER.size).ljust(HEADER.size, b"\0")
+        magic, version, count, degree, bits, flags, _ = HEADER.unpack(header)
+        if magic != SPZ_MAGIC or version not in (2, SPZ_VERSION) or degree >= len(COUNTS):
+            raise Refused(f"expected .spz of version 2 or 3 and degree 0 to 3, got version {version} and degree {degree}")
+        check_limit("gaussians", count, "Gaussians")
+        widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * COUNTS[degree])
+        check_unpacked(len(data), size := count * sum(widths))
+        content = file.read(size + 1)
+    if len(content) < size or (len(content) > size and not flags & MORE_BEHIND):
+        raise Refused(f"expected {count:,} Gaussians in {size:,} bytes, got {'more' if len(content) > size else 'less'}")
+    starts = itertools.accumulate(widths, initial=0)
+    parts = [
+        np.frombuffer(content, "u1", count * width, count * start).reshape(count, width)
+        for start, width in zip(starts, widths, strict=False)
+    ]
+    positions, opacities, colors, scales, quats, harmonics = parts
+    padded = np.pad(positions.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # the lowest of four bytes
+    arrays = {
+        "positions": np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits),
+        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count)) if version == 2 else _smallest_three(quats),
+        "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
+        "alphas": opacities[:, 0] / 255,
+        "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
+        "sh": harmonics.reshape(count, COUNTS[degree], 3) / np.float32(HARMONIC_STEPS) - 1,
+    }
+    return loaded(arrays if degree else {name: arrays[name] for name in list(arrays)[:5]})
+
+
+def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
+    """Inverse of `_packed_quaternions`."""
+    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
+    three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)
+    return with_largest(three / (QUATERNION_STEPS * np.sqrt(2)), word >> 30)[:, [3, 0, 1, 2]]
+
+
+# `.glb`: glTF 2.0 with KHR_gaussian_splatting
+# (https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting): quaternions xyzw, linear scales.
+
+
+logger = logging.getLogger(__name__)
+
+EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
+COEFFICIENTS = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
+
+
+def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
+
+    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
+    """
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    if not len(means):
+        raise ValueError(f"{path}: expected at least one Gaussian")
+    arrays = {
+        "POSITION": ("VEC3", means),
+        "COLOR_0": ("VEC4", np.column_stack([linear_of(colors), np.clip(opacities, 0, 1)])),
+        f"{EXTENSION}:ROTATION": ("VEC4", quats[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:SCALE": ("VEC3", scales),
+        f"{EXTENSION}:OPACITY": ("SCALAR", np.clip(opacities, 0, 1)),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": ("VEC3", sh_of(colors)),
+    }
+    arrays |= {name: ("VEC3", harmonics[:, i]) for i, name in enumerate(COEFFICIENTS[: harmonics.shape[1]])}
+    writer = GlbWriter()
+    attributes = {
+        name: writer.array(kind, values, VERTICES, bounds=name == "POSITION") for name, (kind, values) in arrays.items()
+    }
+    about = {
+        "kernel": "ellipse",
+        "colorSpace": SRGB,
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    document = {
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: about}}]}],
+    }
+    writer.write(path, document)
+
+
+def read_glb(data: bytes) -> Gaussians:
+    """Gaussians of the bytes of a file, those of all nodes in their places. Raises: Refused; what damaged numbers raise."""
+    content, binary = parse_glb(data)
+    if needed := sorted(set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}):
+        raise Refused(f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression")
+    places = node_matrices(content.get("nodes", []))
+    placed = [
+        (part, places[i])
+        for i, node in enumerate(content.get("nodes", []))
+        for part in (content["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ())
+        if EXTENSION in part.get("extensions", {})
+    ]
+    if not placed:
+        raise Refused(f"no Gaussians: expected parts of meshes with {EXTENSION}")
+    check_limit("parts", len(placed), "parts of meshes")
+    counts = [count_of(content["accessors"][part["attributes"]["POSITION"]]) for part, _ in placed]
+    check_limit("gaussians", sum(counts), "Gaussians")
+    spaces = {shown(part["extensions"][EXTENSION].get("colorSpace", SRGB)) for part, _ in placed}
+    if spaces != {shown(SRGB)}:
+        logger.warning("colors of %s are taken as they are: images of them have these colors, too", ", ".join(spaces))
+    parts = [_part(content, binary, part["attributes"], place) for part, place in placed]
+    if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
+        raise Refused("parts with harmonics of different degrees: expected one degree")
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+
+
+def _part(content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"]) -> Gaussians:
+    def array(name: str) -> np.ndarray:
+        if name not in attributes:
+            raise Refused(f"{name}: missing")
+        return read_accessor(content, binary, attributes[name])
+
+    names = [f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0")]
+    arrays = {name: array(name) for name in ("POSITION", *names)}
+    arrays[names[0]] = np.roll(arrays[names[0]], 1, axis=1)
+    arrays[names[2]] = arrays[names[2]].reshape(-1)
+    arrays[names[3]] = colors_of(arrays[names[3]])
+    if count := next(count for count in COUNTS[::-1] if not count or COEFFICIENTS[count - 1] in attributes):
+        arrays["SH"] = np.stack([array(name) for name in COEFFICIENTS[:count]], axis=1)
+    gaussians = loaded(arrays)
+    if np.array_equal(place, np.eye(4)):
+        return gaussians
+    return factored(skin_gaussians(gaussians, jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4))))
