@@ -171,7 +171,7 @@ def test_masks_are_the_share_of_covered_samples_and_depths_their_mean(bank, scen
 
 def draw(scene, bank, seed, close_share, size):
     count = bank.vertex_counts[scene.person]
-    u = np.random.default_rng(seed).random(cameras.CAMERA_NUMBERS, np.float32)
+    u = np.random.default_rng(seed).random(surroundings.CAMERA_NUMBERS, np.float32)
     return camera_from(u, scene.vertices[0], count, 2.1 * seed, close_share, size)
 
 
@@ -280,12 +280,12 @@ def test_cameras_see_all_of_the_person_or_keep_clear_of_it(bank, scene):
         seen, depth = project(camera, jnp.asarray(vertices))
         assert np.all(np.asarray(depth) > 0) and np.asarray(seen).min() > 0 and np.asarray(seen).max() < SIZE
         distance = np.linalg.norm(np.asarray(camera.center) - center)
-        assert distance > cameras.DISTANCE_FACTOR[0] * radius * 0.999
+        assert distance > surroundings.DISTANCE_FACTOR[0] * radius * 0.999
         near = draw(scene, bank, seed, 1.0, SIZE)
         gaps = np.linalg.norm(np.asarray(near.center) - vertices, axis=1)
-        assert gaps.min() > cameras.CLEARANCE - 1e-3
+        assert gaps.min() > surroundings.CLEARANCE - 1e-3
         close.append(np.linalg.norm(np.asarray(near.center) - center) / radius)
-    assert np.mean(close) < cameras.DISTANCE_FACTOR[0]
+    assert np.mean(close) < surroundings.DISTANCE_FACTOR[0]
 
 
 def test_dyes_leave_skin_alone_and_pieces_of_one_cloth_alike():
@@ -310,18 +310,18 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
     normals[np.asarray(faces).reshape(-1)] = corners[:, :3]
     shaded = jax.jit(surroundings.shaded_vertices)
     openness, exact = (np.asarray(x) for x in shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0])))
-    low = vertices.min(0) - np.float32(scene.MARGIN * scene.CELL)
-    grid = np.zeros(scene.GRID)
-    grid[tuple(((vertices - low) / np.float32(scene.CELL)).astype(int).T)] = 1
+    low = vertices.min(0) - np.float32(surroundings.MARGIN * surroundings.CELL)
+    grid = np.zeros(surroundings.GRID)
+    grid[tuple(((vertices - low) / np.float32(surroundings.CELL)).astype(int).T)] = 1
     grid = uniform_filter(uniform_filter(grid, 3, mode="constant"), 3, mode="constant")
-    at = [(vertices + reach * normals - low) / scene.CELL - 0.5 for reach in scene.REACH]
+    at = [(vertices + reach * normals - low) / surroundings.CELL - 0.5 for reach in surroundings.REACH]
     dark = np.mean([map_coordinates(grid, points.T, order=1) for points in at], axis=0)
     expected = np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
     assert np.mean(np.abs(openness - expected) > 1e-4) < 0.01  # a vertex on the edge of a voxel may mark the next one
     used = np.unique(np.asarray(faces))
     for arriving in (exact, np.asarray(shaded(vertices, normals, jnp.asarray([0.0, 1.0, 0.0]), faces)[1])):
         lit = arriving[used]
-        assert lit.min() >= scene.DARKEST and lit.max() <= 1
+        assert lit.min() >= surroundings.DARKEST and lit.max() <= 1
         high, low_down = vertices[used, 1] > vertices[:, 1].max() - 0.03, vertices[used, 1] < 0.05
         assert lit[high].mean() > lit[low_down].mean() + 0.15  # from above: the head is lit, the feet are not
 

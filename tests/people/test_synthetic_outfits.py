@@ -139,7 +139,7 @@ def test_shadows_fall_away_from_the_light():
     below = np.linalg.norm(floor, axis=1) < 0.1
     assert lit[: len(floor)][below].max() < 0.75 < 0.95 < lit[: len(floor)][np.abs(floor[:, 0]) > 0.37].min()
     assert lit[len(floor) :].min() > 0.95  # nothing above the roof
-    assert lit.min() >= scene.DARKEST
+    assert lit.min() >= surroundings.DARKEST
 
 
 def test_exposure_and_white_balance_scale_the_picture():
@@ -155,7 +155,7 @@ def test_highlights_are_bent_not_cut():
     bright = np.linspace(0, 3, 200, dtype=np.float32)[:, None] * np.ones(3, np.float32)
     bent = np.asarray(surroundings.rolled_off(jnp.asarray(bright)))
     np.testing.assert_allclose(bent[bright < surroundings.SHOULDER], bright[bright < surroundings.SHOULDER])
-    assert (np.diff(bent, axis=0) > 0).all() and bent.max() < scene.WHITEST
+    assert (np.diff(bent, axis=0) > 0).all() and bent.max() < surroundings.WHITEST
 
 
 def test_fabrics_of_one_seed_are_one_fabric():

@@ -76,14 +76,14 @@ def test_close_cameras_are_close_and_outside(seed):
     center, radius = surroundings.bounding_sphere(vertices)
     eyes = np.asarray(batch.center)
     nearest = np.linalg.norm(eyes[:, None] - vertices[None], axis=-1).min(1)
-    assert (nearest > cameras.CLEARANCE - 1e-4).all()
+    assert (nearest > surroundings.CLEARANCE - 1e-4).all()
     # the middle of the person is at most the spread away from what a camera looks at
     distance = np.linalg.norm(eyes - center, axis=1) / radius
-    assert (distance < 1.7 + cameras.CLOSE_SPREAD + 0.06).all() and distance.mean() < 1.7
+    assert (distance < 1.7 + surroundings.CLOSE_SPREAD + 0.06).all() and distance.mean() < 1.7
     forward = np.asarray(batch.cam_from_world)[:, 2, :3]
     along = np.einsum("vk,vk->v", center - eyes, forward)
     off_axis = np.linalg.norm(center - eyes - along[:, None] * forward, axis=1)
-    assert (off_axis < radius * cameras.CLOSE_SPREAD + 1e-3).all()  # they look at the person
+    assert (off_axis < radius * surroundings.CLOSE_SPREAD + 1e-3).all()  # they look at the person
     assert (np.arcsin(-forward[:, 1]) > np.deg2rad(-5.1)).all() and (np.arcsin(-forward[:, 1]) < np.deg2rad(15.1)).all()
 
 
