@@ -333,13 +333,6 @@ def test_no_photos_and_more_than_the_limit_are_an_error(body, network, views, me
         reconstruct(*network, capture(body, SIZE, SIZE).select(views))
 
 
-def test_the_place_of_a_number_that_is_none_is_named(body, network):
-    photos = capture(body, SIZE, SIZE)
-    photos.images[0, 3, 4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"reconstruct: capture: images: .*\[0, 3, 4, 1\]: nan"):
-        reconstruct(*network, photos)
-
-
 @pytest.mark.slow
 def test_a_body_that_is_not_finite_is_an_error(body, network):
     photos = capture(replace(body, joint_regressor=body.joint_regressor.at[0, 0].set(np.nan)), SIZE, SIZE)

@@ -65,17 +65,6 @@ def test_turning_the_root_turns_the_body_about_it_and_translation_comes_last(tur
         assert np.abs(np.asarray(after) - expected).max() < 3 * bound(ATOL)
 
 
-def test_vmap_over_shapes_and_poses_equals_a_loop():
-    body = made_up_body(5, dtype=np.float32)
-    cases = [(np.random.default_rng(i).normal(size=4), *random_pose(i)) for i in range(3)]
-    batched = [jnp.asarray(np.stack(x), jnp.float32) for x in zip(*cases, strict=True)]
-    found = jax.jit(jax.vmap(posed, (None, 0, 0, 0)))(body, *batched)
-    for i, case in enumerate(cases):
-        one = posed(body, *case)
-        assert np.allclose(found.vertices[i], one.vertices, atol=ATOL)
-        assert np.allclose(found.joint_transforms[i], one.joint_transforms, atol=ATOL)
-
-
 def test_gradients_at_the_zero_pose_are_finite_and_right():
     with jax.enable_x64(True):
         body = made_up_body(6)

@@ -70,14 +70,6 @@ def test_blending_is_a_weighted_sum():
     assert np.allclose(applied, loop, atol=ATOL)
 
 
-def test_nested_vmap_compiles():
-    joints = jnp.asarray(np.random.default_rng(0).normal(size=(2, len(PARENTS), 3)), jnp.float32)
-    rotations = jnp.zeros((2, 3, len(PARENTS), 3))
-    run = lambda joint, r: model.joint_transforms(joint, PARENTS, r, jnp.zeros(3))
-    found = jax.jit(jax.vmap(jax.vmap(run, (None, 0))))(joints, rotations)
-    assert np.allclose(found, np.eye(4), atol=ATOL)
-
-
 def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own():
     """Two upright rows of vertices, a joint each, 20 cm apart."""
     heights = np.linspace(0, 1, 400)

@@ -24,7 +24,6 @@ from humangs_jax.losses.loss_networks import (
 )
 
 HEADS = Path(__file__).parent / "data" / "torch_heads.pth"
-NETWORKS = {"vgg19": "VGG-19", "vgg": "VGG-16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
 
 
 def state(name, rename=lambda key: key, dtype="float16"):
@@ -52,11 +51,6 @@ def check_weights(weights, name, dtype="float16"):
         assert np.array_equal(weights[layer].kernel, expected.transpose(2, 3, 1, 0))
         assert np.array_equal(weights[layer].bias, made_up_state(name)[f"{layer}.bias"].astype(dtype))
     assert len(weights) == len(BACKBONES[name])
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_expected_tensors(name):
-    assert expected_tensors(NETWORKS[name]) == {key: x.shape for key, x in made_up_state(name).items()}
 
 
 FORMS = {

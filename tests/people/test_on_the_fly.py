@@ -127,12 +127,6 @@ def test_examples_look_like_those_of_the_loader(bank, example, body):
     assert any(np.array_equal(example.inputs.betas, betas) for betas in np.asarray(bank.betas))
 
 
-def test_it_can_be_vmapped_over_keys(bank):
-    keys = jax.random.split(jax.random.key(0), 5)
-    shapes = jax.eval_shape(jax.vmap(lambda key: on_the_fly.on_the_fly_example(bank, key, CONFIG)), keys)
-    assert shapes.inputs.images.shape == (5, 2, 48, 48, 3) and shapes.targets.betas.shape == (5, bank.betas.shape[1])
-
-
 @pytest.mark.slow
 def test_batches_by_vmap_are_the_examples(bank, example):
     keys = jnp.stack([jax.random.key(7), jax.random.key(1)])

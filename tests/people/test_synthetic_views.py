@@ -17,14 +17,12 @@ from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSa
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.people import surroundings, writer
-from humangs_jax.people.bank import build_bank
 from humangs_jax.people.subject import DEMO, GENERATOR_VERSION, SPLITS, seeds_of, split_of
 from humangs_jax.people.writer import find_people
 
 SIZE = 32
 BODY = load_body()
 LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1)
-EIGHT_BITS = 0.5 / 255 + 1e-6
 
 
 @pytest.fixture(scope="module")
@@ -222,11 +220,3 @@ def test_written_training_people_are_training_people(first, count):
                 assert "reach beyond" in str(error) and not written
             else:
                 assert len(written) == count and {split_of(seed) for seed in written} == {split}
-
-
-@pytest.mark.slow
-@given(st.integers(0, 999), st.sampled_from(["validation", "test", "demo"]))
-@settings(deadline=None, max_examples=20)
-def test_a_training_bank_takes_nobody_of_another_split(number, other):
-    with pytest.raises(ValueError, match=f"belongs to the range '{other}', not to 'train'"):
-        build_bank([5, SPLITS[other][number]], BODY, split="train", progress=False)

@@ -190,14 +190,6 @@ def test_decisions_are_the_same_without_jit(name):
         np.testing.assert_array_equal(np.asarray(other.alpha) > 0, np.asarray(eager.alpha) > 0)
 
 
-def test_coincident_depths_keep_the_order_of_their_indices():
-    scene, reverse = (cases.coincident(r) for r in (False, True))
-    image, other = (cases.tiled(s)[0].rgb for s in (scene, reverse))
-    assert np.abs(image - other).max() > 0.1  # the order is visible
-    assert np.ptp(scene.gaussians.means[:, 2]) == 0
-    np.testing.assert_allclose(image, cases.reference_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, np.float16])
 def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):

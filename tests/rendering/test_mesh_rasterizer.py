@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rounding import UNIT
 
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
-from humangs_jax.rendering.mesh.rasterizer import Fragments, RasterConfig, interpolate_attributes, rasterize_mesh, sample_texture
+from humangs_jax.rendering.mesh.rasterizer import RasterConfig, interpolate_attributes, rasterize_mesh, sample_texture
 
 PIXEL_ERROR = 1e-4
 """Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""
@@ -388,16 +388,6 @@ def test_gradients_reach_attributes_and_nothing_else():
     np.testing.assert_allclose(to_attributes.sum(), 100, rtol=1e-5)  # the square holds 10 x 10 pixel centres
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
-def test_lowers_for_every_platform(platform):
-    camera = flat_camera()
-    function = jax.jit(lambda v, f: jax.vmap(lambda v: rasterize_mesh(v, f, camera))(v))
-    shapes = jax.ShapeDtypeStruct((2, 4, 3), jnp.float32), jax.ShapeDtypeStruct((2, 3), jnp.int32)
-    exported = jax.export.export(function, platforms=[platform])(*shapes)
-    assert isinstance(jax.tree.unflatten(exported.out_tree, exported.out_avals), Fragments)
-
-
 TEXEL_ROUNDING = 2e-6
 """Texel positions of up to 16 texels in float32, times color steps of up to 1."""
 UPPER_LEFT, LOWER_RIGHT = (0.0, 1.0), (1.0, 0.0)
@@ -441,11 +431,3 @@ def test_gradient_is_the_weights_of_the_texels():
     expected[1:3, 1:3] = 0.25
     expected[3, 0] = 1
     np.testing.assert_allclose(gradient, expected, atol=TEXEL_ROUNDING)
-
-
-def test_textures_in_float64():
-    with jax.enable_x64(True):
-        texture, uv = np.random.default_rng(0).uniform(size=(3, 5, 2)), np.random.default_rng(1).uniform(size=(1, 2, 2))
-        image = sample_texture(jnp.asarray(texture), jnp.asarray(uv))
-        assert image.dtype == jnp.float64
-        np.testing.assert_allclose(image[0], [lookup(texture, *point) for point in uv[0]], atol=1e-14)

@@ -87,13 +87,3 @@ def test_vertex_normals():
     normals = vertex_normals(jnp.asarray(corners, jnp.float32), jnp.asarray(faces))
     np.testing.assert_allclose(normals[:6], corners[:6], atol=1e-6)
     np.testing.assert_array_equal(normals[6:], 0)
-
-
-@pytest.mark.slow
-def test_float64(golden):
-    with jax.enable_x64(True):
-        posed, canonical, faces = (jnp.asarray(np.asarray(x)) for x in mesh(golden))
-        camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera_of(golden, 1))
-        image, depth = gouraud_position_map(posed.astype(jnp.float64), canonical.astype(jnp.float64), faces, camera)
-        assert image.dtype == depth.dtype == jnp.float64
-        np.testing.assert_allclose(image, golden["position_map_gouraud"][1], atol=GOURAUD_ERROR)

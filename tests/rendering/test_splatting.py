@@ -290,51 +290,6 @@ def test_fitted_buffers_hold_every_view():
     assert default_pairs(50_000, 512, 512) == 12 * 50_000 + 16 * 4096
 
 
-EXTREMES = {
-    "zero scales": lambda g: {"scales": jnp.zeros_like(g.scales)},
-    "zero quaternions": lambda g: {"quats": jnp.zeros_like(g.quats)},
-    "transparent": lambda g: {"opacities": jnp.zeros_like(g.opacities)},
-    "opaque": lambda g: {"opacities": jnp.ones_like(g.opacities)},
-    "huge": lambda g: {"scales": jnp.full_like(g.scales, 1e6)},
-    "beyond huge": lambda g: {"scales": jnp.full_like(g.scales, 1e30)},
-    "long needles": lambda g: {"scales": g.scales.at[:, 0].set(1e4).at[:, 1:].set(0)},
-    "at the near plane": lambda g: {"means": g.means.at[:, 2].set(-0.1 + 0.01 + 1e-6)},
-    "at the camera": lambda g: {"means": jnp.zeros_like(g.means) - camera(np.float32).cam_from_world[:3, 3]},
-    "far beside": lambda g: {"means": g.means.at[:, 0].set(1e6)},
-    "flat": lambda g: {"deformations": jnp.zeros_like(g.deformations)},
-}
-UNSEEN = ("transparent", "beyond huge", "at the camera")
-
-
-@pytest.mark.parametrize("name", EXTREMES)
-def test_extremes_are_finite(name):
-    gaussians = random_gaussians(12, np.float32)
-    gaussians = replace(gaussians, **EXTREMES[name](gaussians))
-    rendering, gradients = tiled(gaussians, camera(np.float32), background(np.float32))
-    for leaf in jax.tree.leaves((rendering, gradients)):
-        assert np.isfinite(leaf).all()
-    assert rendering.rgb.min() >= 0 and rendering.rgb.max() <= 1 + bound(FLOAT32)
-    assert (rendering.alpha.max() == 0) == (name in UNSEEN)
-
-
-@pytest.mark.slow
-def test_empty_scenes_show_the_background():
-    behind = random_gaussians(0, np.float32)
-    behind = replace(behind, means=behind.means.at[:, 2].set(-1.0))
-    for gaussians in (behind, few(behind, np.arange(0))):
-        rendering = render(gaussians, camera(np.float32), background=background(np.float32))
-        np.testing.assert_array_equal(rendering.rgb, np.broadcast_to(background(np.float32), (*VIEW, 3)))
-        assert not rendering.alpha.any() and not rendering.depth.any() and rendering.overflow == 0
-    assert (render(behind, camera(np.float32)).rgb == 1).all()  # white by default
-
-
-@pytest.mark.slow
-def test_one_pixel():
-    with jax.enable_x64(True):
-        gaussians, view = random_gaussians(0), camera(width=1, height=1)
-        assert_close(render(gaussians, view), render_reference(gaussians, view), FLOAT64)
-
-
 @pytest.mark.parametrize(("gradient", "functions"), [(False, 0), (True, 0), (True, 15)])
 def test_lowers_for_every_platform(gradient, functions):
     gaussians, view = random_gaussians(0, np.float32), camera(np.float32)

@@ -101,21 +101,6 @@ def test_pixel_positions_are_those_of_the_image():
     np.testing.assert_array_equal(tiling.tiles_to_image(jnp.asarray(tiles), grid), np.stack([x, y], axis=-1))
 
 
-@pytest.mark.slow
-def test_everything_batches():
-    counts = jnp.asarray(np.random.default_rng(0).integers(0, 4, (3, 20)), jnp.int32)
-
-    def run(counts):
-        expansion = tiling.expand(counts, 64)
-        slot = jnp.arange(64, dtype=jnp.int32)
-        tiles = jnp.where(slot < expansion.needed, (slot * 7) % 5, 5)
-        return expansion, tiling.sort_into_tiles(tiles, expansion.source, 5, 20)
-
-    batched = jax.vmap(run)(counts)
-    for i in range(3):
-        jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), batched, run(counts[i]))
-
-
 GRID = TileGrid(WIDTH, HEIGHT, 4)
 SAMPLES = 400
 """Points per side of a rectangle in the brute force search."""

@@ -195,6 +195,7 @@ def test_the_page_reads_arrays_as_python_does(tmp_path, caplog):
 
 POSES = {"poses": np.zeros((2, 66)), "trans": np.zeros((2, 3))}
 HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
+MOVED = b"MOTION\nFrames: 1\nFrame Time: 1\n0 0 0"
 BAD = {
     "rate": ("a.npz", npz(**POSES, fps=np.inf), "expected a positive number of frames per second, got Infinity"),
     "no rate": ("a.npz", npz(**POSES), "key mocap_framerate: missing"),
@@ -206,11 +207,19 @@ BAD = {
     "keys": ("a.npz", npz(constructor=np.zeros((2, 3)), __proto__=np.zeros(2)), "expected one of the keys rotations, "),
     "odd type": ("a.npz", npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30), "expected one of the keys"),
     "odd channel": ("a.bvh", HEAD.replace("Zrotation", "constructor").encode(), "expected up to 6 channels"),
-    "odd joint": ("a.bvh", (HEAD.replace("Hips", "__proto__") + "MOTION\nFrames: 1\nFrame Time: 1\n0 0 0").encode(), "no joint"),
+    "odd joint": ("a.bvh", HEAD.replace("Hips", "__proto__").encode() + MOVED, "no joint"),
     "instant": ("a.bvh", (HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0").encode(), "a positive Frame Time"),
     "brace": ("a.bvh", b"HIERARCHY {", "unknown word {"),
     "open": ("a.bvh", b"HIERARCHY ROOT Hips { OFFSET 0 0 0", "a brace of the joints is open"),
     "cut": ("a.bvh", b"HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
+    "truncated": ("a.npz", npz(**POSES, fps=30)[:-60], "not an npz archive, or cut short"),
+    "width": ("a.npz", npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30), "poses: expected frames of 165 or 156"),
+    "words": ("a.bvh", b"hello", "not a BVH file"),
+    "strange": (
+        "a.bvh",
+        HEAD.replace("Hips", "Tail").encode() + MOVED,
+        "expected the names of",
+    ),
 }
 
 
