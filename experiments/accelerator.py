@@ -21,7 +21,7 @@ from humangs_jax.avatar.frames import motion_frames
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
-from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loading import find_captures
 from humangs_jax.data.motion import load_motion

@@ -43,7 +43,7 @@ from humangs_jax.apps.start import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
-from humangs_jax.core.compiling import enable_compile_cache
+from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos

@@ -18,7 +18,7 @@ from experiments.results import markdown_table
 from experiments.subjects import shipped_person
 from experiments.timing import timed
 from humangs_jax.avatar.animate import animate
-from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE

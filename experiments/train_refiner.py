@@ -30,7 +30,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import read_npz, write_npz

@@ -19,7 +19,7 @@ from experiments.reconstruction import foreground, matmul_program, random_variab
 from experiments.results import markdown_table
 from experiments.timing import medians, peak_rss_mb
 from humangs_jax.body.library import load_body
-from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry.camera import Camera

@@ -54,6 +54,6 @@ from .evaluation.run import evaluate as evaluate
 
 # JAX
 from .core.pytree import replace as replace
-from .core.compiling import compiler_options as compiler_options, enable_compile_cache as enable_compile_cache
+from .core.processes import compiler_options as compiler_options, enable_compile_cache as enable_compile_cache
 
 __version__: str

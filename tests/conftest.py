@@ -85,7 +85,7 @@ for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isc
 @pytest.fixture(scope="session", autouse=True)
 def _plain_compiler():
     if "HUMANGS_PLAIN_COMPILER" in os.environ:
-        from humangs_jax.core.compiling import CPU_COMPILER_OPTIONS
+        from humangs_jax.core.processes import CPU_COMPILER_OPTIONS
 
         CPU_COMPILER_OPTIONS.clear()
 

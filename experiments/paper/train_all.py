@@ -42,7 +42,7 @@ from experiments.paper.bench import (
 )
 from experiments.paper.people import SIZE, write_plain
 from experiments.results import markdown_table, write_json
-from humangs_jax.core.compiling import enable_compile_cache
+from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.io.reading import read_json
 from humangs_jax.network.weights import load_weights
 

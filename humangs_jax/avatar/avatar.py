@@ -138,17 +138,7 @@ def surface_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], poi
 
 FORMAT = "humangs-avatar"
 VERSION = 1
-_ARRAYS = (
-    "means",
-    "quats",
-    "scales",
-    "opacities",
-    "colors",
-    "skinning_weights",
-    "rest_vertices",
-    "rest_joints",
-    "faces",
-)
+_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "skinning_weights", "rest_vertices", "rest_joints", "faces")
 ALIKE = 1e-3
 """Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")

@@ -300,12 +300,7 @@ def images(
 
 @checked_arguments
 def motion_frames(
-    avatar: Avatar,
-    motion: Motion,
-    shot: Shot | None = None,
-    *,
-    turn: float = 0.0,
-    progress: bool = True,
+    avatar: Avatar, motion: Motion, shot: Shot | None = None, *, turn: float = 0.0, progress: bool = True
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
     shot = Shot() if shot is None else shot
@@ -313,13 +308,7 @@ def motion_frames(
     return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
 
-def without_unseen(
-    avatar: Avatar,
-    poses: BodyPose,
-    cameras: Camera,
-    how: SplatConfig,
-    progress: str | None = None,
-) -> Avatar:
+def without_unseen(avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None) -> Avatar:
     """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one of these images.
 
     Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.

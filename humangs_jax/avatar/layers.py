@@ -136,13 +136,7 @@ def write_views(
 
 
 def exr_view(
-    name: str,
-    avatar: Avatar,
-    pose: BodyPose,
-    camera: Camera,
-    rendering: Rendering,
-    layers: Iterable[str],
-    how: SplatConfig,
+    name: str, avatar: Avatar, pose: BodyPose, camera: Camera, rendering: Rendering, layers: Iterable[str], how: SplatConfig
 ) -> ExrView:
     """A view with its layers. rendering: of this avatar, pose and camera onto black."""
     layers, alpha = set(layers), np.asarray(rendering.alpha)

@@ -119,8 +119,7 @@ def _prepare(verbose: bool) -> None:
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
-    from humangs_jax.core.compiling import enable_compile_cache
-    from humangs_jax.core.processes import keep_freed_memory
+    from humangs_jax.core.processes import enable_compile_cache, keep_freed_memory
 
     silence(verbose)
     keep_freed_memory()

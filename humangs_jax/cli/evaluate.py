@@ -115,7 +115,7 @@ class Evaluate:
     def _kept(self) -> Path | None:
         """A folder in the user's cache, that of the same command on the same files; None where nothing can be written."""
         from humangs_jax import __version__
-        from humangs_jax.core.compiling import user_cache
+        from humangs_jax.core.processes import user_cache
 
         named = [self.source, self.avatar, self.weights, self.predictions, self.indices, self.body]
         named += [file for files in vars(self.lpips).values() for file in files]

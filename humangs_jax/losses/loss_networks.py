@@ -22,17 +22,7 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.reading import open_file, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
-from humangs_jax.losses.perceptual import (
-    BACKBONES,
-    VGG19,
-    Convolution,
-    Lpips,
-    Slices,
-    Vgg19,
-    Weights,
-    channels,
-    convolutions,
-)
+from humangs_jax.losses.perceptual import BACKBONES, VGG19, Convolution, Lpips, Slices, Vgg19, Weights, channels, convolutions
 from humangs_jax.network.conversion import LOSS_PREFIX
 
 LPIPS_NETWORKS = {"vgg": "VGG-16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}

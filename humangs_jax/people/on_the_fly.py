@@ -22,9 +22,9 @@ from jax import lax
 
 from humangs_jax.body.model import joint_transforms
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
-from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import SUBJECT_STREAM, Example
 from humangs_jax.data.views import SubjectViews

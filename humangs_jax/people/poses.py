@@ -220,12 +220,7 @@ def draw_goal(rng: np.random.Generator) -> str:
 
 
 def bend_arm(
-    rng: np.random.Generator,
-    build: kin.Build,
-    rotations: kin.Rotations,
-    goal: str,
-    side: int,
-    other_arm: bool = False,
+    rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations, goal: str, side: int, other_arm: bool = False
 ) -> float:
     """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
 

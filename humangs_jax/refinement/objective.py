@@ -18,8 +18,8 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
-from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.numerics import safe_divide
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.losses.losses import decibels, structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig

@@ -60,10 +60,7 @@ def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConf
 
 @checked_arguments
 def plan_buffers(
-    gaussians: Gaussians,
-    cameras: Camera,
-    config: SplatConfig | str = DEFAULT_CONFIG,
-    margin: float = 1.25,
+    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, margin: float = 1.25
 ) -> SplatConfig:
     """A configuration with buffers for one camera, or for the most demanding one of a batch, times `margin`.
 

@@ -199,7 +199,7 @@ def product(a: Float[Array, "*b m p"], b: Float[Array, "*b p n"], config: SplatC
 # Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks until the longest list ends or
 # all its pixels have. A chunk's arrays (block, chunk, pixels) stay in the cache, and its chain of splats is unrolled, once for
 # each thing that the loop carries: XLA makes of each ONE kernel that runs the chain in registers. Once a pixel has stopped, the
-# loop carries -T, which keeps the final T. Compile with `core.compiling.compiler_options`: sharing small kernels out over threads
+# loop carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small kernels out over threads
 # costs more than it gains, and the barriers have to be kept.
 
 LINK = 2

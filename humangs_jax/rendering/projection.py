@@ -33,12 +33,7 @@ from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, added_colors, added_variance
-from humangs_jax.rendering.splat_config import (
-    DEFAULT_CONFIG,
-    LARGEST_FOOTPRINT,
-    LEAST_DIMMING,
-    SplatConfig,
-)
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, LARGEST_FOOTPRINT, LEAST_DIMMING, SplatConfig
 
 Planes = list[Array]
 """Arrays of (g,) numbers."""

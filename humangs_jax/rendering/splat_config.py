@@ -94,10 +94,7 @@ class SplatConfig:
     )
     """Whether `Rendering.visibility` is computed."""
     max_pairs: Slots | None = knob(
-        None,
-        cost="pairs beyond it are not drawn, counted and reported",
-        gain="memory, one compilation",
-        measured=MEASURED,
+        None, cost="pairs beyond it are not drawn, counted and reported", gain="memory, one compilation", measured=MEASURED
     )
     """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and
     takes `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
@@ -117,10 +114,7 @@ class SplatConfig:
     chunk_backward: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
     """Likewise with gradients."""
     matmul_precision: Literal["float32", "bfloat16"] = knob(
-        "float32",
-        cost="8e-4 of the gradient",
-        gain="none on CPUs; meant for accelerators, not timed there",
-        measured=MEASURED,
+        "float32", cost="8e-4 of the gradient", gain="none on CPUs; meant for accelerators, not timed there", measured=MEASURED
     )
     """Of the gradient's sums over pixels: "bfloat16" rounds their factors to 8 bits."""
 

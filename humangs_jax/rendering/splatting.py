@@ -22,8 +22,8 @@ from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
-from humangs_jax.core.compiling import compiler_options
 from humangs_jax.core.numerics import at_least_float32, safe_divide
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.io.images import image_row, named_color, png_bytes
@@ -129,10 +129,7 @@ def render(
 
 @checked_arguments
 def render_views(
-    gaussians: Gaussians,
-    cameras: Camera,
-    config: SplatConfig | str = DEFAULT_CONFIG,
-    background: Background = None,
+    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, background: Background = None
 ) -> Rendering:
     """Draw every camera of a batch (leading axis v), one after the other: working memory does not grow with v.
 
@@ -164,10 +161,7 @@ def render_views(
 
 @checked_arguments
 def seen_from(
-    gaussians: Gaussians,
-    cameras: Camera,
-    config: SplatConfig | str = DEFAULT_CONFIG,
-    threshold: float = ALPHA_MIN,
+    gaussians: Gaussians, cameras: Camera, config: SplatConfig | str = DEFAULT_CONFIG, threshold: float = ALPHA_MIN
 ) -> Bool[Array, " g"]:
     """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
 
@@ -304,11 +298,7 @@ def draw(
 
 
 def draw_views(
-    gaussians: Gaussians,
-    cameras: Camera,
-    background: Float[Array, "3"],
-    config: SplatConfig,
-    features: Array | None = None,
+    gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"], config: SplatConfig, features: Array | None = None
 ) -> Rendering:
     """`draw` for every camera of a batch, one after the other."""
     project = lambda camera: project_gaussians(gaussians, camera, config)

@@ -177,7 +177,7 @@ def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
     """The same numbers, stored before they are used.
 
     XLA's CPU backend would evaluate the expression behind a table anew for each number that a gather takes from it.
-    It respects the barrier where a program is compiled with `core.compiling`.
+    It respects the barrier where a program is compiled with `core.processes.compiler_options`.
     """
     return lax.optimization_barrier(array)
 

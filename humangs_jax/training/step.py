@@ -12,7 +12,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
-from humangs_jax.core.compiling import compiler_options
+from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks

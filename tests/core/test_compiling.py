@@ -7,12 +7,12 @@ import sys
 import jax
 import pytest
 
-from humangs_jax.core import compiling
-from humangs_jax.core.compiling import OF_JAX, VARIABLE, enable_compile_cache
+from humangs_jax.core import processes
+from humangs_jax.core.processes import OF_JAX, VARIABLE, enable_compile_cache
 
 USE = """
 import sys
-from humangs_jax.core.compiling import enable_compile_cache
+from humangs_jax.core.processes import enable_compile_cache
 print(enable_compile_cache(), "jax" in sys.modules)
 import jax, jax.numpy as jnp
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
@@ -76,7 +76,7 @@ def test_the_programs_used_last_are_kept(tmp_path, monkeypatch):
     other = tmp_path / "jax-0.1" / "notes.txt"
     other.write_bytes(bytes(1000))
     jax.config.update("jax_compilation_cache_dir", None)
-    monkeypatch.setattr(compiling, "LARGEST", 150)
+    monkeypatch.setattr(processes, "LARGEST", 150)
     enable_compile_cache(tmp_path)
     assert [file.exists() for file in (*files, other)] == [False, True, False, True]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from training_cases import tube, write_subject
 
-from humangs_jax.core.compiling import CPU_COMPILER_OPTIONS
+from humangs_jax.core.processes import CPU_COMPILER_OPTIONS
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.training import step
 from humangs_jax.training.config import tiny

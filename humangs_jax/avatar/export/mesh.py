@@ -156,12 +156,7 @@ def write_animation(path: Path, files: Sequence[Path], avatar: Avatar, motion: M
 
 
 def write_mesh_glb(
-    path: str | os.PathLike[str],
-    avatar: Avatar,
-    mesh: BodyMesh,
-    motion: Motion | None = None,
-    name: str = "motion",
-    up: Up = "y",
+    path: str | os.PathLike[str], avatar: Avatar, mesh: BodyMesh, motion: Motion | None = None, name: str = "motion", up: Up = "y"
 ) -> None:
     """Write mesh, skin and motion; the file appears whole or not at all.
 
@@ -179,11 +174,7 @@ def write_mesh_glb(
         "materials": [
             {
                 "name": "skin",
-                "pbrMetallicRoughness": {
-                    "baseColorTexture": {"index": 0},
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 1.0,
-                },
+                "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
                 "extensions": {"KHR_materials_unlit": {}},
             }
         ],
@@ -240,11 +231,7 @@ def _skin(writer: GlbWriter, avatar: Avatar) -> dict[str, Any]:
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
     matrices[:, 3, :3] = -np.asarray(avatar.rest_joints)  # column by column, as glTF has them
     inverse = writer.array("MAT4", matrices.reshape(-1, 16))
-    return {
-        "joints": list(range(len(avatar.parents))),
-        "inverseBindMatrices": inverse,
-        "skeleton": avatar.parents.index(-1),
-    }
+    return {"joints": list(range(len(avatar.parents))), "inverseBindMatrices": inverse, "skeleton": avatar.parents.index(-1)}
 
 
 def _animation(writer: GlbWriter, avatar: Avatar, motion: Motion, name: str) -> dict[str, Any]:

@@ -40,16 +40,7 @@ SMALLEST_SCALE = 1e-9
 """Metres; keeps the logarithm finite for flat Gaussians."""
 LONGEST_HEADER = 1 << 16
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-}
+TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
 TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
@@ -388,12 +379,7 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     attributes = {
         name: writer.array(kind, values, VERTICES, bounds=name == "POSITION") for name, (kind, values) in arrays.items()
     }
-    about = {
-        "kernel": "ellipse",
-        "colorSpace": SRGB,
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
+    about = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     document = {
         "extensionsUsed": [EXTENSION],
         "scene": 0,

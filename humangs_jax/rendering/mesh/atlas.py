@@ -143,12 +143,7 @@ def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _flatten(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    normals: np.ndarray,
-    charts: np.ndarray,
-    sides: np.ndarray,
-    density: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, charts: np.ndarray, sides: np.ndarray, density: np.ndarray
 ) -> _Flat:
     """Every chart in a plane across its mean normal, turned so that its box is small, as large as its density says."""
     count = int(charts.max()) + 1

@@ -225,13 +225,7 @@ def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, A
 
 
 def _z_buffer(
-    corners: Array,
-    first_row: Array,
-    row_begin: Array,
-    row_end: Array,
-    width: int,
-    height: int,
-    config: RasterConfig,
+    corners: Array, first_row: Array, row_begin: Array, row_end: Array, width: int, height: int, config: RasterConfig
 ) -> tuple[Array, Array]:
     """Depth and face of every pixel (h w): infinity and NO_FACE where there is none."""
 
