@@ -161,8 +161,8 @@ def _wait(sentinel: int) -> None:
     os._exit(1)
 
 
-# How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is where it lies, and how large it
-# may grow.
+# How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is where it lies, and how large
+# it may grow.
 
 VARIABLE, OF_JAX = "HUMANGS_COMPILE_CACHE", "JAX_COMPILATION_CACHE_DIR"
 LARGEST = 2 << 30
