@@ -5,8 +5,9 @@
 
 The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
 Makes the people first: `--people` of the training seeds, rendered anew for every step, and 8 of the validation seeds. The same
-command continues the run in `--out`; Ctrl-C, SIGTERM and the end of `--hours` save. The mean of the first and
-the trained weights is often better than both (Wortsman et al. 2022, https://arxiv.org/abs/2109.01903): `--start-share` writes it.
+command continues the run in `--out`; Ctrl-C, SIGTERM and the end of `--hours` save. `--loss.lpips 0.1` adds LPIPS (AlexNet), with
+the extra `lpips`. The mean of the first and the trained weights is often better than both (Wortsman et al. 2022,
+https://arxiv.org/abs/2109.01903): `--start-share` writes it.
 
 On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine. How the shipped weights came about is in
 humangs_jax/assets/weights.md.
@@ -27,6 +28,7 @@ import tyro
 from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import keep_freed_memory
 from humangs_jax.data.loading import find_captures
+from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.network.config import HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
@@ -85,7 +87,8 @@ def main(
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
     training = training_people(None, people, out, body) if bank is None else on_the_fly_people(load_bank(bank))
     try:
-        state = train(config, body, training, out, validation=find_captures(validation), variables=variables)
+        networks = load_loss_networks(lpips_net="alex", installed=True)
+        state = train(config, body, training, out, validation=find_captures(validation), variables=variables, networks=networks)
     except TrainingInterrupted as stopped:
         if hours is None or timer.is_alive():  # it was not the timer
             raise
