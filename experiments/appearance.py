@@ -1,6 +1,7 @@
 """What eyes see of an avatar: LPIPS of the whole person and of the head, errors in the foreground, what is drawn beside it."""
 
 import contextlib
+import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import read_json
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.perceptual import lpips
+from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement import learned
 from humangs_jax.refinement.config import HEAD_STEPS, ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import SHIPPED
@@ -55,6 +57,14 @@ VARIANTS: dict[Variant, dict[str, Any]] = {
     "default": {"displacement": None, "head_steps": HEAD_STEPS},
 }
 """How the body is displaced to the masks, and steps on the head."""
+DECODERS: dict[str, tuple[str, slice, float, float]] = {
+    "harder opacities": ("appearance_out", slice(3, None, 4), 1.5, 0.0),
+    "opacities twice as hard": ("appearance_out", slice(3, None, 4), 2.0, 0.0),
+    "harder choice of a shell": ("shells_out", slice(None), 2.0, 0.0),
+    "one shell a Gaussian": ("shells_out", slice(None), 20.0, 0.0),
+    "flatter along the normal": ("geometry_out", slice(9, None, 10), 1.0, -0.5),
+}
+"""Changes of the trained decoder without another training: layer, its outputs, factor of their logits, and what is added."""
 
 
 @entry
@@ -182,6 +192,62 @@ def appearance_section(numbers: dict[str, Any], start: Any) -> str:
     header = ["photos", "body off", "views", "people", "avatar", *(heading for heading, _ in SHOWN.values())]
     about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
     return f"{about}\n\n{markdown_table(header, rows, 'lllll' + 'r' * len(SHOWN))}"
+
+
+# The forward pass ---------------------------------------------------------------------------------------------------------
+
+
+@entry
+def forward_pass(
+    run: Run, people: People = People(8, held_out=6, poses=0, split="validation"), runs: tuple[str, ...] = ()
+) -> None:
+    """What other networks gain: the shipped one changed by hand, and others, before and after the learned iterations.
+
+    Needs the extra `lpips`.
+
+    Options:
+    runs: rows, NAME=FILE: weights of `humangs train` or `train_shipped.py`
+    """
+    start = people.start()
+    networks = {"alex": load_lpips("alex")}
+    rows: dict[str, tuple[Any, Any]] = {"shipped": (start.variables, start.config)}
+    rows |= {name: (changed(start.variables, *change), start.config) for name, change in DECODERS.items()}
+    for name, _, file in (text.partition("=") for text in runs):
+        variables, config = load_weights(Path(file))
+        rows[name] = (
+            variables,
+            dataclasses.replace(start.config, architecture=config.architecture, conventions=config.conventions),
+        )
+    settings = start.settings | {"runs": {text.partition("=")[0]: file_digest(Path(text.partition("=")[2])) for text in runs}}
+
+    def measure(seed):
+        subject = make_evaluation_subject(seed, start.body, (VIEWS,), start.size, start.held_out)
+        inputs, row = subject.inputs(VIEWS), {}
+        for name, weights in rows.items():
+            first = reconstruct(*weights, inputs)
+            for how, avatar in {
+                "feed-forward": first,
+                "refined": refine(first, inputs, RefineConfig(steps=0, head_steps=0)),
+            }.items():
+                drawn = draw_views(avatar, subject.held_out)
+                row[f"{name}, {how}"] = scores_of(drawn.images, np.asarray(drawn.alpha), subject.held_out, networks)
+        return row
+
+    found = means(list(run.rows({str(seed): functools.partial(measure, seed) for seed in start.seeds}, settings).values()))
+    scores = {key: shown for key, shown in SHOWN.items() if not key.startswith("vgg")}
+    cell = lambda name, how: [f"{found[f'{name}, {how}'][key]:.{digits}f}" for key, (_, digits) in scores.items()]
+    lines = [[name, how, *cell(name, how)] for how in ("feed-forward", "refined") for name in rows]
+    header = ["network", "avatar", *(heading for heading, _ in scores.values())]
+    table = markdown_table(header, lines, "ll" + "r" * len(scores))
+    run.show(f"{start.about()}\n\n{table}", {"settings": settings, "means": found})
+
+
+def changed(variables: Any, layer: str, outputs: slice, factor: float, added: float) -> Any:
+    """Variables of the network with other logits of the decoder."""
+    decoder = variables["params"]["decoder"]
+    kernel, bias = decoder[layer]["kernel"], decoder[layer]["bias"]
+    own = {"kernel": kernel.at[:, outputs].multiply(factor), "bias": bias.at[outputs].multiply(factor).at[outputs].add(added)}
+    return variables | {"params": variables["params"] | {"decoder": decoder | {layer: own}}}
 
 
 # A blind comparison -------------------------------------------------------------------------------------------------------
