@@ -75,6 +75,7 @@ def appearance(
     off: tuple[float, ...] = (0.0, 5.0),
     variants: tuple[Variant, ...] = ("iterations alone", "default"),
     first_refiner: Path | None = None,
+    first_network: Path | None = None,
     details_sheet: Path | None = None,
     pairs: Path | None = None,
 ) -> None:
@@ -87,6 +88,7 @@ def appearance(
     off: millimetres that the body is off, see `refinement`
     variants: how avatars are made
     first_refiner: weights of the learned update for the first variant; default: the shipped ones
+    first_network: weights of the network for the first variant; default: those of the others
     details_sheet: faces, hands, hems and shoes: truth and the first two variants, largest size
     pairs: folder of sheets that show the first two variants in random order, for `appearance_votes`
     """
@@ -94,6 +96,8 @@ def appearance(
     networks = {net: load_lpips(net) for net in NETS}
     settings = start.settings | {"sizes": sizes, "off": off, "variants": variants, "refiner": shipped_digest(SHIPPED)}
     settings |= {"first_refiner": first_refiner and file_digest(first_refiner)}
+    settings |= {"first_network": first_network and file_digest(first_network)}
+    first = load_weights(first_network)[0] if first_network else start.variables
 
     def measure(seed):
         row: dict[str, Any] = {}
@@ -102,8 +106,8 @@ def appearance(
             subject = with_body_off(person(size), wrong)
             truth, inputs, drawn = subject.held_out, subject.inputs(VIEWS), {}
             for name in variants:
-                refiner = first_refiner if name == variants[0] else None
-                drawn[name] = _drawn(start, inputs, truth, refiner, **VARIANTS[name])
+                network, refiner = (first, first_refiner) if name == variants[0] else (start.variables, None)
+                drawn[name] = _drawn(network, start.config, inputs, truth, refiner, **VARIANTS[name])
             for task, views in task_views(truth).items():
                 seen = truth.select(views)
                 of_task = {name: (images[views], alpha[views]) for name, (images, alpha) in drawn.items()}
@@ -146,13 +150,13 @@ def groups_of(rows: list[dict[str, Any]], first: str) -> dict[str, list[dict[str
     return groups if len(rows) > LOOSEST else {"all": rows}
 
 
-def _drawn(start, photos, held_out, refiner, displacement, head_steps, longest_edge=None):
+def _drawn(network, config, photos, held_out, refiner, displacement, head_steps, longest_edge=None):
     """Images and alpha of held-out views of an avatar. refiner: weights of the learned update instead of the shipped ones."""
     own = mock.patch.object(learned, "load_refiner", functools.partial(learned.read_refiner, refiner))
-    config = start.config.with_runtime(displacement=displacement, longest_edge=longest_edge)
+    config = config.with_runtime(displacement=displacement, longest_edge=longest_edge)
     how = RefineConfig(iterations=ITERATIONS, steps=0, head_steps=head_steps)
     with own if refiner else contextlib.nullcontext():
-        avatar = refine(reconstruct(start.variables, config, photos), photos, how)
+        avatar = refine(reconstruct(network, config, photos), photos, how)
     drawn = draw_views(avatar, held_out)
     return drawn.images, np.asarray(drawn.alpha)
 
