@@ -23,7 +23,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.loading import find_captures
+from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.network.humangs import apply_humangs

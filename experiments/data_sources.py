@@ -14,8 +14,7 @@ from PIL import Image
 from experiments import made_up
 from experiments.harness import Run, entry
 from experiments.results import markdown_table, significant
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, ViewSampling
 from humangs_jax.data.preprocess.run import Settings, preprocess
 

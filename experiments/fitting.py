@@ -15,7 +15,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
+from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS
 from humangs_jax.data.motion import load_motion
 from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise

@@ -22,11 +22,9 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17, KEYPOINT_SETS, MEDIAPIPE_33, mirrored_name
+from humangs_jax.data.keypoints.keypoints import COCO_17, KEYPOINT_SETS, MEDIAPIPE_33, Keypoints, mirrored_name
 from humangs_jax.data.photos import Photos
-from humangs_jax.detection.blazepose import Networks
-from humangs_jax.detection.people import detect_people
+from humangs_jax.detection.people import Networks, detect_people
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.fit_capture import fit_photos

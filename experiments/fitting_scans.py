@@ -17,7 +17,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.fitting.scan_files import sample_scan
 from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import make_subject, seeds_of
 

@@ -19,7 +19,7 @@ from experiments.bodies import write_smplx
 from experiments.harness import Run, entry
 from humangs_jax.body.library import load_body
 from humangs_jax.body.resolution import decimate
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_people, turned
+from humangs_jax.data.datasets.subject import BodyParameters, FileBody, posed_people, turned
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import to_uint8
 from humangs_jax.people.bank import bake_subject, lit_texture

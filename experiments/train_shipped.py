@@ -27,7 +27,7 @@ import tyro
 
 from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import keep_freed_memory
-from humangs_jax.data.loading import find_captures
+from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.network.config import HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import init_humangs

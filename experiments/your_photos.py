@@ -15,7 +15,7 @@ from humangs_jax.avatar.video import tile
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.io.images import read_image, write_png
 from humangs_jax.io.reading import write_json
 from humangs_jax.people.writer import Layout, write_person

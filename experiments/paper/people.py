@@ -15,8 +15,9 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
-from humangs_jax.data.loading import CaptureSource, Example, PeopleCache, StoredSubject, find_captures
-from humangs_jax.data.loading.captures import CaptureFolder
+from humangs_jax.data.loading import CaptureSource, Example, PeopleCache
+from humangs_jax.data.loading.captures import CaptureFolder, find_captures
+from humangs_jax.data.loading.examples import StoredSubject
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.people.fabrics import Fabric, random_color

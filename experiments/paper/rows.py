@@ -10,8 +10,7 @@ import numpy as np
 
 from experiments.paper.bench import animatable, folder_of, last_weights, shown, takes_one, trained_names
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.evaluation.cases import Case, choose_views, find_people
 from humangs_jax.evaluation.run import evaluate

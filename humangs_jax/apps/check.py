@@ -265,7 +265,6 @@ def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndar
 
 
 def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
-    """The body over a photo, its longest side as long as that of any tile."""
     shown = capture.select([view]).resized(LONGEST_SIDE)
     pose = capture.pose(int(capture.frames[view]))
     return draw_body(capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0])[0]
@@ -274,7 +273,6 @@ def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
 def _with_keypoints(
     image: Float[np.ndarray, "h w 3"], capture: Capture, keypoints: Keypoints, examination: Examination, view: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """An image with discs, crosses, and the lines between them."""
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]
@@ -316,7 +314,6 @@ def _fit_label(examination: Examination, view: int) -> str:
 
 
 def _ticks(highest: float | int, count: float | int, whole: bool = False) -> Float[np.ndarray, " n"]:
-    """Round numbers from 0 to `highest`, about `count`."""
     rough = highest / count
     power = 10.0 ** np.floor(np.log10(rough))
     step = power * next(x for x in (1, 2, 5, 10) if x * power >= rough * (1 - 1e-9))

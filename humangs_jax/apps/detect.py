@@ -22,12 +22,10 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, seen_person, write_people
-from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, seen_person, write_people
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.photos import Photos, load_photos, read_description
-from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
-from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people, sharpened
+from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
 from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colors, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
@@ -212,13 +210,11 @@ def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n
 
 
 def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
-    """Pixels of each person in all photos together."""
     people = zip(*(photo.people for photo in photos), strict=True)
     return [sum(found.area for found in person if found is not None) for person in people]
 
 
 def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[list[Found | None]]:
-    """The people of each photo in a common order."""
     times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
     matches = [match_people([_seen(photos[v], cameras, int(v)) for v in own], MEDIAPIPE_33.mirror) for own in times]
     rows: list[list[Found | None]] = [[] for _ in photos]
@@ -292,7 +288,6 @@ def person_of(photos: Sequence[PhotoPeople], keypoints: Keypoints, folder: Path)
 
 
 def _best(photos: Sequence[PhotoPeople], agreement: Callable[[int, np.ndarray], float], given: str, folder: Path) -> int:
-    """The person with the most agreement over all photos."""
     count = len(photos[0].people)
     sums = [sum(agreement(v, person_mask(p, i)) for v, p in enumerate(photos) if p.people[i] is not None) for i in range(count)]
     if max(sums, default=0.0) <= 0:
@@ -395,7 +390,6 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
 
 
 def _images(photos: Sequence[PhotoPeople], numbers: Sequence[int]) -> list[ImagePeople]:
-    """The photos with some of the people, as the file has them."""
     people = lambda photo: tuple(None if (found := photo.people[i]) is None else found.person for i in numbers)
     return [ImagePeople(photo.name, photo.size, people(photo)) for photo in photos]
 

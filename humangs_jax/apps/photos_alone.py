@@ -16,7 +16,7 @@ from humangs_jax.apps.detect import PhotoPeople
 from humangs_jax.apps.start import photo_files
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
-from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, PersonViews, cameras_from_person
 from humangs_jax.io.images import DIAGONAL_35MM, focal_length, image_size, resized, write_png
@@ -89,7 +89,6 @@ class _Looked(NamedTuple):
 
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | None, out: Path) -> _Looked:
-    """Who is in the photos. looked_at: the files, or their reduced copies in the folder `images`."""
     names = [file.relative_to(images).as_posix() for file in looked_at]
     photos = detect.same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
     # beside `out`, which a refusal leaves as it is
@@ -113,7 +112,6 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | 
 def _written(
     looked: _Looked, images: Path, out: Path, height: float | None, masks: Path | None, own_masks: bool
 ) -> PhotosImported:
-    """The capture folder with cameras from the person."""
     photos, number, shown, _, seen = looked
     found = cameras_from_person(seen, height=height)
     calibration = _calibration(seen, found, images)
@@ -165,7 +163,6 @@ def _repaired(photo: PhotoPeople, number: int, mirrored: bool) -> PhotoPeople:
 
 
 def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tuple[str, ...]:
-    """What was found, for the user."""
     centers = np.asarray([camera.center for camera in found.cameras], float)
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))
     count = len(found.views)

@@ -175,7 +175,6 @@ def _exchanged_cameras(views: _Views) -> dict[int, int]:
 
 
 def _fault(views: _Views, i: int) -> ViewFault:
-    """What is wrong with one view."""
     body, inside, height = _silhouette(views, i)
     mask = None if views.masks is None else views.masks[i]
     if mask is not None and not mask.any():
@@ -234,7 +233,6 @@ def _closed(cells: Cells) -> Cells:
 
 
 def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:
-    """The cells whose centres the mask has."""
     height, width = mask.shape
     (rows, columns), cell = _grid(width, height)
     at = lambda count, most: np.minimum(((np.arange(count) + 0.5) * cell).astype(int), most - 1)
@@ -242,12 +240,10 @@ def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:
 
 
 def _grid(width: int, height: int) -> tuple[tuple[int, int], float]:
-    """Rows and columns of cells, and the side of one in pixels."""
     cell = max(width, height) / GRID
     return (max(1, round(height / cell)), max(1, round(width / cell))), cell
 
 
 def _overlap(a: Cells, b: Cells) -> float:
-    """Intersection over union."""
     union = (a | b).sum()
     return float((a & b).sum() / union) if union else 0.0

@@ -155,10 +155,7 @@ def reconstruct_with(
     photos = settings.photos(capture)
     avatar = reconstruct(variables, settings.network(config), photos)
     if settings.refinement is not None:
-        run = refine_with_report(avatar, photos, settings.refinement, progress=progress)
-        if run.interrupted:
-            raise KeyboardInterrupt
-        avatar = run.avatar
+        avatar = _uninterrupted(refine_with_report(avatar, photos, settings.refinement, progress=progress)).avatar
     return jax.block_until_ready(avatar)
 
 
@@ -238,11 +235,11 @@ class Budget:
     frame_ms: float | None = None
     memory_mb: float | None = None
 
-    def allows(self, cost: Cost, margin: float = MARGIN) -> bool:
+    def allows(self, cost: Cost) -> bool:
         """Whether a cost is within the budget with room to spare (memory needs none: it does not depend on other programs)."""
         pairs = (
-            (self.reconstruct_ms, margin * cost.reconstruct_ms),
-            (self.frame_ms, margin * cost.frame_ms),
+            (self.reconstruct_ms, MARGIN * cost.reconstruct_ms),
+            (self.frame_ms, MARGIN * cost.frame_ms),
             (self.memory_mb, cost.memory_mb),
         )
         return all(most is None or value is None or value <= most for most, value in pairs)

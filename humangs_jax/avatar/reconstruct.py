@@ -372,10 +372,6 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
-def _prepare_subjects(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
-    return jax.lax.map(lambda views: prepare_inputs(body, views, config), batch)
-
-
 def _check(capture: Capture, name: str) -> None:
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
@@ -422,4 +418,4 @@ def _equal(body: BodyModel, other: BodyModel) -> bool:
 
 
 _prepare = jax.jit(prepare_inputs)
-_prepare_batch = jax.jit(_prepare_subjects)
+_prepare_batch = jax.jit(lambda body, batch, config: jax.lax.map(lambda views: prepare_inputs(body, views, config), batch))

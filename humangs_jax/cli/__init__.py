@@ -44,7 +44,7 @@ GROUPS = {
     "Take it along": {"export": "avatars.Export"},
     "Prepare photos": {"detect": "captures.Detect", "import": "captures.ImportCameras", "fit": "fit.Fit", "check": "fit.Check"},
     "Research": {
-        "evaluate": "evaluate.Evaluate",
+        "evaluate": "training.Evaluate",
         "synth": "captures.Synth",
         "preprocess": "training.Preprocess",
         "train": "training.Train",
@@ -115,7 +115,6 @@ def execute(arguments: Sequence[str]) -> int:
 
 
 def _prepare(verbose: bool) -> None:
-    """Settings of the process."""
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()

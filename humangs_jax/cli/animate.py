@@ -168,7 +168,6 @@ class Render:
         suggest("humangs animate", self.avatar)
 
     def _render_gaussians(self, views: int) -> None:
-        """Of a file of Gaussians."""
         said = {"pose": self.pose != "t", "capture": self.capture, "exr": self.exr, "prune": self.shot.prune}
         if wrong := [name for name, given in said.items() if given]:
             raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
@@ -250,7 +249,6 @@ class View:
 
 
 def _drawn_by(shot: Shot, preset: Preset | None, config: Path | None) -> Shot:
-    """The shot, drawn as a preset or a file of settings says."""
     settings = chosen_settings(preset, config)
     return shot if settings is None else settings.shot(shot)
 

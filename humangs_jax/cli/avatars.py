@@ -297,7 +297,6 @@ def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "Refin
 
 
 def _save(avatar: "Avatar", out: Path, how: str) -> None:
-    """Write an avatar and say so."""
     with stage("writing"):
         avatar.save(out)
     wrote(out, f"{len(avatar.gaussians.means):,} Gaussians {how}")
@@ -393,7 +392,6 @@ class Export:
         wrote(written, f"{what}{poses}, feet on 0{beside}")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
-        """The frames asked for, and their numbers where there are many."""
         from humangs_jax.avatar.export.gaussians import frame_range
         from humangs_jax.core.pytree import replace
 

@@ -25,7 +25,7 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 
 def keypoints_wanted() -> tuple[str, ...]:
     """What `humangs fit` has to be told: nothing where it finds keypoints itself."""
-    from humangs_jax.detection.blazepose import available
+    from humangs_jax.detection.people import available
 
     return () if available() else ("--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",)
 

@@ -142,7 +142,7 @@ class Fit:
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
-            from humangs_jax.detection.blazepose import available
+            from humangs_jax.detection.people import available
             from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.landmark_fit import FitConfig
@@ -272,7 +272,7 @@ class Check:
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.photos import capture_folder
-            from humangs_jax.detection.blazepose import available
+            from humangs_jax.detection.people import available
             from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         with stage("reading the capture"):

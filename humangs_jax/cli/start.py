@@ -87,7 +87,7 @@ class Start:
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
         from humangs_jax.apps.start import missing
-        from humangs_jax.detection.blazepose import available
+        from humangs_jax.detection.people import available
         from humangs_jax.io.reading import read_json
 
         if self._resumes():
@@ -126,7 +126,6 @@ class Start:
         self._finish(*self._fit(material), limits)
 
     def _from_photos_alone(self, material: "Material", limits: dict[str, Any] | None) -> None:
-        """Cameras, keypoints and masks from the person in the photos."""
         with stage("finding the person and the cameras"):
             from humangs_jax.apps.detect import SHEET_FILE
             from humangs_jax.apps.photos_alone import import_photos
@@ -152,7 +151,6 @@ class Start:
         self._finish(*self._fit(material, found.one_moment), _without_head(limits))
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
-        """Masks and keypoints of the imported photos where there are none."""
         with stage("finding the person"):
             from humangs_jax.apps import detect
             from humangs_jax.data.keypoints.reading import read_keypoints
@@ -199,12 +197,10 @@ class Start:
         return fitted
 
     def _finish(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
-        """The steps after the fit."""
         self._check(capture)
         self._reconstruct(capture, None if limits is None else estimate, limits)
 
     def _import(self, material: "Material") -> "ImportReport":
-        """Photos and cameras as a capture folder."""
         with stage("importing photos and cameras"):
             from humangs_jax.data.calibration.importing import import_cameras
             from humangs_jax.io.reading import write_json
@@ -222,9 +218,6 @@ class Start:
         return report
 
     def _fit(self, material: "Material", one_moment: bool | None = None) -> "tuple[Capture, HeldOut | None]":
-        """The body, written into the capture folder, and what a held-out photo says of it, if it was asked. one_moment: of photos
-        alone, see `PhotosImported`.
-        """
         with stage("fitting the body"):
             from humangs_jax.apps.detect import MASKS
             from humangs_jax.apps.start import better_body
@@ -274,7 +267,6 @@ class Start:
         return capture, estimate
 
     def _check(self, capture: "Capture") -> None:
-        """The sheet of the body over the photos, and what it says."""
         with stage("checking"):
             from humangs_jax.apps.check import check_capture
 
@@ -283,7 +275,6 @@ class Start:
         wrote(self.out / "check.png", "the body over the photos: look at it")
 
     def _reconstruct(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
-        """Avatar and page."""
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.usable_views import usable_views

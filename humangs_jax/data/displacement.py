@@ -225,7 +225,6 @@ def _crossing(
 
 
 def _silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
-    """1 where the body is, in a window."""
     triangles = pixels[faces]
     a, b, c = np.moveaxis(triangles, 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]

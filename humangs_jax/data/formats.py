@@ -1,4 +1,4 @@
-"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a file with its reader and a line here.
+"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a reader and a line here.
 
 `--help`, `humangs start`, errors and the tables in the docs are made of these rows.
 """
@@ -14,15 +14,15 @@ from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 # Cameras and keypoints --------------------------------------------------------------------------------------------------
 # The module of a row has two functions; where several recognize a file, the first reads it, those of its suffix before others.
 # Suffixes are for files that are neither JSON nor text.
-#     recognizes(source) -> bool            whether the content of a file is of this format; not asked where `folder` is set
-#     read(source, format) -> Calibration   or Detections; source: `calibration.Source`, `keypoints.keypoints.Source`
+#     recognizes_NAME(source) -> bool            whether the content of a file is of this format; not asked where `folder` is set
+#     read_NAME(source, format) -> Calibration   or Detections; source: `calibration.Source`, `keypoints.keypoints.Source`
 
 F = TypeVar("F", bound="SourceFormat")
 
 
 @dataclasses.dataclass(frozen=True)
 class SourceFormat(Format):
-    """A format whose files have usual names, but are known by their content. Its code is "module:read"."""
+    """A format whose files have usual names, but are known by their content. Its code is "module:read_NAME"."""
 
     files: tuple[str, ...] = ()
     """Usual names in a folder, patterns of `Path.glob`."""
@@ -86,12 +86,12 @@ class SourceFormats(Formats[F]):
         return "; ".join(map(str, self.values()))
 
 
-_CAMERAS, _KEYPOINTS = "humangs_jax.data.calibration.", "humangs_jax.data.keypoints."
+_CAMERAS, _KEYPOINTS = "humangs_jax.data.calibration.", "humangs_jax.data.keypoints.formats:read_"
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
         "COLMAP",
-        _CAMERAS + "colmap:read",
+        _CAMERAS + "scenes:read_colmap",
         files=tuple(place + name for place in _MODELS for name in ("images.txt", "cameras.txt", "images.bin")),
         content="text or binary: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
         folder=True,
@@ -100,7 +100,7 @@ CAMERAS = SourceFormats(
     ),
     easymocap=CameraFormat(
         "EasyMocap",
-        _CAMERAS + "easymocap:read",
+        _CAMERAS + "rigs:read_easymocap",
         files=("intri.yml", "extri.yml"),
         content="`names`, `K_NAME`, `dist_NAME`, `Rot_NAME` or `R_NAME`, `T_NAME`",
         folder=True,
@@ -108,7 +108,7 @@ CAMERAS = SourceFormats(
     ),
     transforms=CameraFormat(
         "NeRF, instant-ngp, nerfstudio or VHAP",
-        _CAMERAS + "transforms:read",
+        _CAMERAS + "scenes:read_transforms",
         files=("transforms.json",),
         content="JSON with `frames`: `transform_matrix` is camera-to-world with OpenGL's axes",
         up="+z",
@@ -117,7 +117,7 @@ CAMERAS = SourceFormats(
     ),
     toml=CameraFormat(
         "Caliscope, Anipose or Pose2Sim",
-        _CAMERAS + "toml:read",
+        _CAMERAS + "rigs:read_toml",
         (".toml",),
         files=("camera_array.toml", "calibration.toml", "Calib*.toml"),
         content="TOML: `matrix`, `distortions`, `rotation`, `translation`, `size` in a table of each camera",
@@ -125,20 +125,20 @@ CAMERAS = SourceFormats(
     ),
     qualisys=CameraFormat(
         "Qualisys",
-        _CAMERAS + "qualisys:read",
+        _CAMERAS + "rigs:read_qualisys",
         files=("*.qca.txt",),
         content="XML: `transform`, `fov_video`, `intrinsic` of each camera",
         up="+z",
     ),
     panoptic=CameraFormat(
         "CMU Panoptic",
-        _CAMERAS + "panoptic:read",
+        _CAMERAS + "rigs:read_panoptic",
         files=("calibration_[0-9]*.json",),
         content="JSON: a list `cameras` of `K`, `distCoef`, `R`, `t`, `resolution`",
     ),
     opencv=CameraFormat(
         "OpenCV, AvatarReX or THuman4.0",
-        _CAMERAS + "opencv:read",
+        _CAMERAS + "rigs:read_opencv",
         files=("calibration_full.json", "calibration.json", "calibration_shelf.json"),
         content="YAML or JSON: `K`, `R`, `T` in a map of each camera, or `K_NAME`, `R_NAME`, `T_NAME`; lens as `dist...` or "
         "`D`, size as `imgSize`, `image_size` or `width`, `height`",
@@ -148,26 +148,29 @@ CAMERAS = SourceFormats(
 KEYPOINTS = SourceFormats(
     humangs=SourceFormat(
         "humangs detect",
-        _KEYPOINTS + "own:read",
+        _KEYPOINTS + "own",
         suffixes=(".npz",),
         files=("keypoints.json", "keypoints.npz"),
         content="33 points of BlazePose; `save_keypoints` (.npz): any set",
     ),
     openpose=SourceFormat(
-        "OpenPose", _KEYPOINTS + "openpose:read", files=("openpose",), content="`--write_json`, a file an image: BODY_25, hands"
+        "OpenPose",
+        _KEYPOINTS + "openpose",
+        files=("openpose",),
+        content="`--write_json`, a file an image: BODY_25, hands",
     ),
     easymocap=SourceFormat(
-        "EasyMocap", _KEYPOINTS + "easymocap:read", files=("annots",), content="`annots`, a file an image: BODY_25, hands"
+        "EasyMocap", _KEYPOINTS + "easymocap", files=("annots",), content="`annots`, a file an image: BODY_25, hands"
     ),
     coco=SourceFormat(
         "COCO, COCO-WholeBody or AlphaPose",
-        _KEYPOINTS + "coco:read",
+        _KEYPOINTS + "coco",
         files=("alphapose-results.json", "alphapose.json"),
         content="results, or images and annotations: 17, 26, 133 or 136 points",
     ),
     mmpose=SourceFormat(
         "MMPose",
-        _KEYPOINTS + "mmpose:read",
+        _KEYPOINTS + "mmpose",
         files=("rtmpose", "mmpose", "predictions"),
         content="inferencer or demo scripts, a file an image or a video: 17, 26, 133 or 136 points",
     ),
@@ -285,8 +288,8 @@ MOTIONS = Formats(
     tcmr=_arrays("TCMR", "pose verts", "all=pose", use=_ALONE | {"stays": True}),
     local=_arrays("WHAM of one camera", "pose frame_ids", "all=pose", use=_ALONE | {"stays": True}),
     smpl=_arrays("SMPL (pose)", "pose", "all=pose", up="z", also=("y", "-y")),
-    bvh=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.bvh:read_bvh", (".bvh",)),
-    glb=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.gltf:read_animation", (".glb", ".vrma")),
+    bvh=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.clips:read_bvh", (".bvh",)),
+    glb=MotionFormat("skeletons of other programs", "humangs_jax.data.motion.clips:read_animation", (".glb", ".vrma")),
 )
 """By name, in the order in which keys and files are asked."""
 
@@ -317,8 +320,8 @@ DATASETS: Formats[DataSetFormat] = Formats(
         "thuman": _data_set("THuman2.0 and 2.1", "thuman:thuman", scans=True),
         "thuman4": _data_set("THuman4.0", "multiview:thuman4"),
         "avatarrex": _data_set("AvatarReX", "multiview:avatarrex"),
-        "actorshq": _data_set("ActorsHQ", "actorshq:actorshq"),
-        "dna-rendering": _data_set("DNA-Rendering", "dna_rendering:dna_rendering"),
+        "actorshq": _data_set("ActorsHQ", "multiview:actorshq"),
+        "dna-rendering": _data_set("DNA-Rendering", "multiview:dna_rendering"),
     }
 )
 """By name, in the order in which a folder is compared with them."""

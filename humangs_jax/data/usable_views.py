@@ -28,19 +28,13 @@ POINTS = 1000
 
 
 def usable_views(capture: Capture) -> Capture:
-    """The capture with the views of `usable_indices`; the same object where these are all."""
-    usable = usable_indices(capture)
-    return capture if len(usable) == capture.view_count else capture.select(usable)
+    """The capture with the views that show the person: all but those of `unusable_views`, which a warning names.
 
-
-def usable_indices(capture: Capture) -> list[int]:
-    """The views that show the person: all but those of `unusable_views`, which a warning names. All of them without masks.
-
-    Raises: CaptureError, one line that names the views, if none is left.
+    The same object where these are all, and without masks. Raises: CaptureError, one line that names the views, if none is left.
     """
     found = unusable_views(capture)
     if not found:
-        return list(range(capture.view_count))
+        return capture
     told = "; ".join(
         f"{', '.join(capture.names[i] for i in found if found[i] == reason)}: {reason}"
         for reason in dict.fromkeys(found.values())
@@ -49,7 +43,7 @@ def usable_indices(capture: Capture) -> list[int]:
         raise CaptureError("capture", "masks", f"no view is left that shows the person: {told}")
     count = f"{len(found)} of {capture.view_count} views {'is' if len(found) == 1 else 'are'}"
     logger.warning("%s left out: %s", count, told)
-    return [i for i in range(capture.view_count) if i not in found]
+    return capture.select([i for i in range(capture.view_count) if i not in found])
 
 
 def unusable_views(capture: Capture) -> dict[int, str]:
@@ -132,7 +126,6 @@ def points_in_image(
 def _sampling(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """Corners (p, 3) and weights (p, 3) of points that are spread evenly over a mesh."""
     areas = face_areas(vertices, faces)
     rng = np.random.default_rng(0)
     chosen = np.searchsorted(np.cumsum(areas), (np.arange(count) + 0.5) / count * areas.sum())

@@ -18,7 +18,7 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.motion.rules import nearest_axis, standing_axis, turned_upright, upright_matrix
-from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_indices, usable_views
+from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
@@ -310,18 +310,18 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
     Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
     is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
     https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count; photos whose mask does not show
-    the person are never chosen (`usable_indices`).
+    the person are never chosen (`usable_views`).
 
     Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
     """
     if count is not None and count < 1:
         raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    usable = usable_indices(capture)
+    names, capture = capture.names, usable_views(capture)
+    usable = [names.index(name) for name in capture.names]
     if count is not None and len(usable) <= count:
         return usable
-    capture = capture.select(usable)
     body = decimate(capture.body, SELECTION_VERTICES) if len(capture.body.template) > SELECTION_VERTICES else capture.body
-    quality = np.asarray(_quality(body, standardize(capture, SELECTION_SIZE)))
+    quality = np.asarray(view_quality(body, standardize(capture, SELECTION_SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
     least = LEAST_GAIN if count is None else 0.0
     chosen = greedy_cover(quality * area, capture.view_count if count is None else count, least)
@@ -344,6 +344,7 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
     return chosen
 
 
+@jax.jit
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     """How well every view shows every vertex, in [0, 1].
 
@@ -365,6 +366,3 @@ def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     cameras = views.cameras.in_units(unit)
     shown = jax.vmap(quality)(cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps)
     return shown / jnp.maximum(jnp.max(shown), 1e-6)
-
-
-_quality = jax.jit(view_quality)

@@ -1,1 +1,0 @@
-"""People of a photo: landmarks in pixels and metres, and masks, by BlazePose."""

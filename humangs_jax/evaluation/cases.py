@@ -17,8 +17,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.data.capture import Capture, load_capture
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.photos import capture_folder

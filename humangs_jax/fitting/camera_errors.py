@@ -139,7 +139,7 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
 
 def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple[CameraError, ...], Keypoints]:
     """The cameras that are late, and the keypoints as if they were not; what then has no photo has no certainty."""
-    camera_of = np.asarray(camera_origin(photos.cameras, photos.frames, True).camera)
+    camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     count, frames, found = int(camera_of.max()) + 1, photos.frame_count, {}
     if not 3 <= count <= TIMED or frames < TIMED:
         return (), keypoints
@@ -205,7 +205,7 @@ class _Seen:
         """None if there is too little to say anything. edge: moments at either end that are left out."""
         kinds = [name.removeprefix("left_").removeprefix("right_") in PARTS for name in keypoints.set.names]
         observations, views = group_by_frame(photos, keypoints)
-        camera_of = np.asarray(camera_origin(photos.cameras, photos.frames, True).camera)
+        camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
         count = int(camera_of.max()) + 1
         if count < 3 or count > CAMERAS:
             return None
@@ -309,7 +309,6 @@ class _Seen:
 
 
 def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """(..., 3, 3) matrices of the cross product with vectors."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
     rows = ((none, -z, y), (z, none, -x), (-y, x, none))
@@ -330,7 +329,6 @@ class _Solved:
 
 
 def _solved(gradients: Float[np.ndarray, "k u"], matrices: Float[np.ndarray, "k u u"], cameras: list[int]) -> _Solved:
-    """The rotations of some cameras while the others stay."""
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
     own, curved = gradients[:, at], matrices[:, at[:, None], at]
     total = curved.sum(0)

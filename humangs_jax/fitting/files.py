@@ -25,11 +25,10 @@ from humangs_jax.body.landmarks import usual_certainty
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
-from humangs_jax.data.capture_checks import CaptureError, numbers
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
+from humangs_jax.data.capture_checks import CaptureError, few, numbers
+from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, Keypoints
 from humangs_jax.data.photos import capture_folder, read_description
-from humangs_jax.fitting.report import FitReport, listed
+from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
 from humangs_jax.io.arrays import read_npz, write_npz
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
@@ -58,7 +57,7 @@ class FitRecord:
     def of_views(self, names: Sequence[str]) -> Keypoints:
         """The keypoints of views, in their order. Raises: ValueError if the fit knows one of them not."""
         if missing := [name for name in names if name not in self.names]:
-            raise ValueError(f"the capture's fit knows no view {listed(missing)}: fit it again")
+            raise ValueError(f"the capture's fit knows no view {few(missing)}: fit it again")
         rows = [self.names.index(name) for name in names]
         points, confidences = (getattr(self.keypoints, name)[rows] for name in ("points", "confidences"))
         return dataclasses.replace(self.keypoints, points=points, confidences=confidences)
@@ -83,32 +82,28 @@ def read_fit_record(path: str | Path) -> FitRecord:
     """Read fit.npz. Raises: CaptureError naming file and key."""
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
-        return _read_fit_record(path)
-
-
-def _read_fit_record(path: Path) -> FitRecord:
-    values, pickled = read_npz(path)
-    if pickled:
-        raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
-    for key in KEYS:
-        if key not in values:
-            raise CaptureError(path, key, "missing: expected a file that `humangs fit` wrote")
-    name = str(values["set"])
-    if name not in KEYPOINT_SETS:
-        raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
-    names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
-    v, k = len(names), len(kind.names)
-    offsets = numbers(values["places"], path, "places", (k, 3))
-    kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
-    points = numbers(values["points"], path, "points", (v, k, 2))
-    confidences = numbers(values["confidences"], path, "confidences", (v, k))
-    noise = numbers(values["noise"], path, "noise")
-    joint_std = numbers(values["joint_std"], path, "joint_std")
-    determined = numbers(values["determined"], path, "determined", joint_std.shape)
-    if noise.shape != joint_std.shape[:1]:
-        raise CaptureError(path, "noise", f"expected {joint_std.shape[:1]} frames, got {noise.shape}")
-    covariance = numbers(values["shape_covariance"], path, "shape_covariance")
-    return FitRecord(Keypoints(points, confidences, kind), names, noise, joint_std, determined, covariance)
+        values, pickled = read_npz(path)
+        if pickled:
+            raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
+        for key in KEYS:
+            if key not in values:
+                raise CaptureError(path, key, "missing: expected a file that `humangs fit` wrote")
+        name = str(values["set"])
+        if name not in KEYPOINT_SETS:
+            raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
+        names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
+        v, k = len(names), len(kind.names)
+        offsets = numbers(values["places"], path, "places", (k, 3))
+        kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
+        points = numbers(values["points"], path, "points", (v, k, 2))
+        confidences = numbers(values["confidences"], path, "confidences", (v, k))
+        noise = numbers(values["noise"], path, "noise")
+        joint_std = numbers(values["joint_std"], path, "joint_std")
+        determined = numbers(values["determined"], path, "determined", joint_std.shape)
+        if noise.shape != joint_std.shape[:1]:
+            raise CaptureError(path, "noise", f"expected {joint_std.shape[:1]} frames, got {noise.shape}")
+        covariance = numbers(values["shape_covariance"], path, "shape_covariance")
+        return FitRecord(Keypoints(points, confidences, kind), names, noise, joint_std, determined, covariance)
 
 
 # Captures ------------------------------------------------------------------------------------------------------------
@@ -126,16 +121,17 @@ def check_place(source: str | Path, out: str | Path | None, overwrite: bool, inp
     target = source if out is None else Path(out)
     description = read_description(source / "capture.json")
     if target.resolve() != source.resolve():
-        check_replaceable(target, overwrite, "capture.json", (source, *inputs, *_photo_files(source, description)))
+        photos = (source / file for file in _photo_files(description))
+        check_replaceable(target, overwrite, "capture.json", (source, *inputs, *photos))
     elif (body := target / description["body"]).exists() and not overwrite:
         raise ArgumentError("overwrite", f"is needed: {body} exists; or another folder for the fit")
     check_writable(target)
     return target
 
 
-def _photo_files(folder: Path, description: dict[str, Any]) -> list[Path]:
-    """Images and masks of a capture."""
-    return [folder / view[key] for view in description["views"] for key in ("image", "mask") if key in view]
+def _photo_files(description: dict[str, Any]) -> list[str]:
+    """Images and masks of a capture, as its description has them."""
+    return sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view})
 
 
 def write_fitted(
@@ -161,7 +157,7 @@ def write_fitted(
 
     def write(folder: Path):
         folder.mkdir()
-        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
+        for file in _photo_files(description):
             _copy(source, folder, file)
         write_fit(folder)
 

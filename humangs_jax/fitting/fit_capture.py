@@ -117,7 +117,6 @@ def _determined(problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]) -> 
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r p"], Float[Array, "m r s"], Float[Array, "m j 3 p"], Float[Array, "m j 3 s"]]:
-    """Derivatives of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
     problem = keypoint_problem(model)
 
     def both(seen, vector, betas):
@@ -242,7 +241,6 @@ def examine_record(
 def _errors(
     model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, observations: Observations
 ) -> Float[Array, "m c k 2"]:
-    """(m, c, k, 2) landmarks less keypoints, pixels."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(keypoint_errors)(observations, landmarks)
 

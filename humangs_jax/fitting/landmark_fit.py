@@ -27,7 +27,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.keypoints.sets import mirrored_name
+from humangs_jax.data.keypoints.keypoints import mirrored_name
 from humangs_jax.fitting.residuals.keypoints import (
     RAYLEIGH_MEDIAN,
     KeypointProblem,
@@ -41,14 +41,17 @@ from humangs_jax.fitting.residuals.keypoints import (
     keypoint_residuals,
     trunk_weights,
 )
-from humangs_jax.fitting.solve import Outcome, half_squares, robust, solve
 from humangs_jax.fitting.state import (
     FREE,
     FitState,
+    Outcome,
     betas_of,
     frame_axes,
+    half_squares,
     pose_of,
     pose_prior,
+    robust,
+    solve,
     state_of,
     usual_origin,
     zero_state,
@@ -66,6 +69,8 @@ ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
 """Of keypoint errors in these stages and in that of the person, standard deviations."""
 STARTS = (4, 2)
 """Orientations that are followed, for one view and for several."""
+STEPS = 150
+"""Of the solver in a stage of one frame, at most."""
 TOLERANCE = 3e-4
 """Of the unknowns, which are of unit size."""
 
@@ -76,8 +81,6 @@ class FitConfig:
 
     smoothness: float = 0.0
     """Expected acceleration of joints, metres per frame squared; 0: frames are independent."""
-    steps: int = 150
-    """Of the solver in a stage of one frame, at most."""
     person_steps: int = 150
     """Of the solver for all frames together, at most."""
 
@@ -118,7 +121,7 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitC
 def _fit_frames(model: LandmarkModel, observations: Observations, config: FitConfig) -> LandmarkFit:
     """All stages but the motion."""
     problem = keypoint_problem(model)
-    states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
+    states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
@@ -145,7 +148,6 @@ def _result(
 
 
 def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
-    """The poses of a state of m frames, a batch."""
     return jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
 
 
@@ -156,14 +158,14 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
     return KeypointProblem(model, prior, origin)
 
 
-def _fit_frame(problem: KeypointProblem, seen: Observations, config: FitConfig) -> tuple[FitState, dict[str, Outcome]]:
+def _fit_frame(problem: KeypointProblem, seen: Observations) -> tuple[FitState, dict[str, Outcome]]:
     """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
     several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
     starts = _rigid_starts(problem, seen, points, counts, STARTS[several])
     targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
     stages = _stages(problem, targets)
-    states, outcomes = jax.vmap(lambda start: _run_stages(problem, seen, start, stages, config))(starts)
+    states, outcomes = jax.vmap(lambda start: _run_stages(problem, seen, start, stages))(starts)
     best = jnp.argmin(outcomes.after[:, -1])
     state, outcomes = jax.tree.map(lambda leaf: leaf[best], (states, outcomes))
     return state, {name: jax.tree.map(lambda leaf, i=i: leaf[i], outcomes) for i, name in enumerate(STAGES)}
@@ -245,7 +247,6 @@ def _position(
 
 
 def _metres_per_pixel(seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]) -> Float[Array, ""]:
-    """Metres per pixel at the person's distance."""
     centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
     each = distance / seen.K[:, :1, 0]
@@ -270,7 +271,6 @@ BODY = (*BODY_NAMES, "jaw")
 
 
 def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
-    """A batch of the four stages."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
     body = np.asarray([model.joint_names[j] in BODY for j in problem.origin.joints])[:, None]
@@ -294,22 +294,18 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
 
-def _run_stages(
-    problem: KeypointProblem, seen: Observations, start: FitState, stages: _Stage, config: FitConfig
-) -> tuple[FitState, Outcome]:
+def _run_stages(problem: KeypointProblem, seen: Observations, start: FitState, stages: _Stage) -> tuple[FitState, Outcome]:
     """All stages, each from the end of the one before. Returns the state and outcomes of each."""
 
     def run(state, stage):
         weighted = replace(seen, confidences=seen.confidences * stage.views)
         residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
-        return solve(residuals, state, config.steps, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
+        return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
 
     return jax.lax.scan(run, start, stages)
 
 
 def _noise_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " m"]:
-    """(m,) std of the detections after the first stages, pixels."""
-
     def of_frame(seen, state):
         lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)
         return found_noise(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan), seen.noise)

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.fitting.similarity import align_points
+from humangs_jax.fitting.triangulation import align_points
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
@@ -166,12 +166,10 @@ def _pixel_errors(evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "*n c 
 
 
 def _turned(rig: Rig) -> Float[np.ndarray, "*n c k 3"]:
-    """Landmarks in the axes of every camera."""
     return rig.landmarks[..., None, :, :] @ np.swapaxes(rig.rotations, -1, -2)
 
 
 def _residuals(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"], scale: float) -> Float[np.ndarray, "n r"]:
-    """(n, r) for unknowns (n, u), in standard deviations."""
     rig = _moved(evidence, start, y)
     turned, root = _turned(rig), np.sqrt(evidence.weights)[..., None]
     errors = _pixel_errors(evidence, rig, turned) / evidence.noise[:, None, None]

@@ -18,7 +18,7 @@ from humangs_jax.body.model import shape_body
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.sets import mirrored_name
+from humangs_jax.data.keypoints.keypoints import mirrored_name
 from humangs_jax.fitting.person_bundle import Evidence, Rig, adjust, align_views, pixel_errors, place_person
 from humangs_jax.fitting.residuals.keypoints import NOISE, OPTICAL_AXIS, OUTER
 from humangs_jax.geometry.camera import Camera
@@ -64,7 +64,7 @@ class PersonViews:
 
     points: (c, k, 2) pixels, centres at +0.5. visibility: (c, k) in [0, 1]; 0: not seen. world: (c, k, 3) metres about the
     middle of the hips in the camera's axes (x right, y down, z away), as if the camera looked straight at the person. names: of
-    the landmarks, see `data.keypoints.sets`. sizes: (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
+    the landmarks, see `KeypointSet`. sizes: (width, height) of the photos, pixels. focal: (c,) pixels, NaN where unknown.
     photos: their names.
     """
 
@@ -246,7 +246,6 @@ def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[n
 
 
 def _ray(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"], focal: float) -> Float[np.ndarray, "3"]:
-    """The unit direction in which a camera sees the person."""
     direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
     return direction / np.linalg.norm(direction)
 
@@ -268,7 +267,6 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 
 
 def _with_mirrored(seen: PersonViews, mirror: Int[np.ndarray, " k"]) -> "_Trial":
-    """The cameras with the sides of mirrored views changed back."""
     views = len(seen.points)
     found = _try(seen, mirror, np.zeros(views, bool))
     if views > 1:
@@ -310,7 +308,6 @@ def _least(seen: PersonViews, mirror: Int[np.ndarray, " k"], start: _Trial) -> _
 
 
 def _try(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> _Trial:
-    """Bundle adjustment with these views (c,) mirrored."""
     evidence, start = _evidence(seen, mirror, mirrored)
     return _Trial(mirrored, *adjust(evidence, start), evidence)
 
@@ -339,7 +336,6 @@ def _middle(points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str) -
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """The direction (3,) of toes and nose, from heels and ears."""
     ends = (("left_foot_index", "left_heel"), ("right_foot_index", "right_heel"), ("left_big_toe", "left_heel"))
     ends = (*ends, ("right_big_toe", "right_heel"))
     found = [points[names.index(a)] - points[names.index(b)] for a, b in ends if a in names and b in names]
@@ -349,7 +345,6 @@ def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def _across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """The direction (3,) of the left side."""
     side = lambda part: points[names.index(f"left_{part}")] - points[names.index(f"right_{part}")]
     return side("shoulder") + side("hip")
 

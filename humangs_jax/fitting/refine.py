@@ -47,10 +47,11 @@ from humangs_jax.fitting.residuals.silhouettes import (
     silhouette_residuals,
     view_body,
 )
-from humangs_jax.fitting.solve import NORMAL_MAD, Outcome, solve
 from humangs_jax.fitting.state import (
+    NORMAL_MAD,
     FitState,
     Origin,
+    Outcome,
     StateStd,
     betas_of,
     camera_origin,
@@ -58,6 +59,7 @@ from humangs_jax.fitting.state import (
     clothing_thickness,
     pose_of,
     segments,
+    solve,
     with_cameras,
     zero_state,
 )
@@ -70,6 +72,10 @@ LM_UNKNOWNS = 400
 """With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns."""
 PATIENCE = 6
 """Steps of L-BFGS for one of least squares."""
+STEPS, LONGEST_SIDE = 4, 512
+"""Of the solver in a round; pixels to which larger photos are shrunk."""
+REACH = (0.08, 0.015)
+"""How far points look in the first and the last round, shares of the person's height in the image."""
 KEYPOINT_SCALE = 5.0
 """Robust scale of keypoints, standard deviations."""
 BARE = 5.0
@@ -80,27 +86,20 @@ BARE = 5.0
 class CaptureRefineConfig:
     """Static settings of a refinement.
 
-    std: how far off the start is expected to be. shared_focal: focal lengths that start equal stay equal. coefficients: of the
-    shape, where the capture has fewer. fixed_cameras: only shape and poses move. iterations: number of matchings; steps: of the
-    solver in each. points: of a silhouette.
-    independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
-    the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
-    the mask. longest_side: larger photos are shrunk to this many pixels.
+    std: how far off the start is expected to be. coefficients: of the shape, where the capture has fewer. fixed_cameras: only
+    shape and poses move. iterations: number of matchings. points: of a silhouette. independent: number of independent equations
+    that all points of a view count for. robust_scales: multiples of the reach, outwards and inwards of the mask.
     keypoints_worse: a result whose keypoints' error is more than this multiple of the
     start's is not kept; a fit to them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
     """
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
-    shared_focal: bool = True
     coefficients: int = 10
     fixed_cameras: bool = False
     iterations: int = 10
-    steps: int = 4
     points: int = 300
     independent: float = 30.0
-    reach: tuple[float, float] = (0.08, 0.015)
     robust_scales: tuple[float, float] = (1.0, 0.5)
-    longest_side: int = 512
     keypoints_worse: float = 1.3
 
 
@@ -145,7 +144,7 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
         betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
         pose=capture.poses,
         body_pose_std=jnp.full((len(joints), 3), np.radians(config.std.body_pose), jnp.float32),
-        cameras=camera_origin(cameras, capture.frames, config.shared_focal),
+        cameras=camera_origin(cameras, capture.frames),
         segment=jnp.asarray(segments(body.parents, joints)),
         joints=joints,
         std=config.std,
@@ -223,19 +222,19 @@ def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
     return jnp.where(clothing < 0, BARE * clothing, clothing)
 
 
-@functools.partial(jax.jit, static_argnames=("independent", "steps"))
+@functools.partial(jax.jit, static_argnames="independent")
 def solve_round(
-    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float, steps: int
+    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float
 ) -> tuple[FitState, Outcome]:
-    """The state after at most `steps` steps with fixed matches."""
+    """The state after some steps with fixed matches."""
 
     def residuals(y):
         counted = replace(y, clothing=_counted(y.clothing))
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     if sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS:
-        return solve(residuals, state, PATIENCE * steps, method="lbfgs")
-    return solve(residuals, state, steps, method="lm")
+        return solve(residuals, state, PATIENCE * STEPS, method="lbfgs")
+    return solve(residuals, state, STEPS, method="lm")
 
 
 # Iterations ----------------------------------------------------------------------------------------------------------
@@ -258,8 +257,8 @@ class Scene:
 
     def __init__(self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig) -> None:
         self.capture, self.config = capture, config
-        small = max(capture.images.shape[1:3]) <= config.longest_side
-        looked_at = capture if small else capture.resized(config.longest_side)
+        small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
+        looked_at = capture if small else capture.resized(LONGEST_SIDE)
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
         self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
@@ -279,11 +278,11 @@ class Scene:
         expected standard deviations.
         """
         config, state, outcomes, move = self.config, start_state(self.origin, self.config), [], 0.0
-        first, last = config.reach
+        first, last = REACH
         for turn in range(config.iterations):
             evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)))
             before = state
-            state, outcome = solve_round(self.model, self.origin, evidence, state, config.independent, config.steps)
+            state, outcome = solve_round(self.model, self.origin, evidence, state, config.independent)
             outcomes.append(outcome)
             moves = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before)
             move = max(jax.tree.leaves(moves))
@@ -357,7 +356,6 @@ def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPo
 def _keypoint_errors(
     model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, seen: Observations, frames: Int[np.ndarray | Array, " v"]
 ) -> Float[Array, "v c k"]:
-    """(v, 1, k) pixels."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(reprojection_errors)(seen, landmarks[frames])
 
@@ -430,7 +428,6 @@ def refine_capture(
 
 
 def _check(capture: Capture, keypoints: Keypoints | None) -> None:
-    """Whether there is anything to refine by."""
     masks = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
     if keypoints is not None and len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}")

@@ -17,8 +17,8 @@ from humangs_jax.body.model import EXACT, BodyPose
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.progress import text_table
 from humangs_jax.data.capture import Capture
-from humangs_jax.fitting.solve import Outcome
-from humangs_jax.fitting.state import pose_prior, violations
+from humangs_jax.data.capture_checks import few
+from humangs_jax.fitting.state import Outcome, pose_prior, violations
 from humangs_jax.fitting.swaps import Swap
 from humangs_jax.geometry import quaternion
 
@@ -153,7 +153,6 @@ def _stage_rows(stages: Sequence[Stage]) -> list[str]:
 
 
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:
-    """A table with the columns that are known."""
     by_keypoints, by_masks = any(v.keypoints for v in views), any(v.iou_after is not None for v in views)
     shown = views
     if len(views) > ROWS:
@@ -259,19 +258,13 @@ def keypoint_warnings(
             far.setdefault((each.joint, each.axis), []).append(each)
     for (joint, axis), of in far.items():
         worst = max(each.degrees for each in of)
-        frames = listed([str(each.frame) for each in of])
+        frames = few([str(each.frame) for each in of], NAMED)
         found.append(f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}")
     return tuple(found)
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
 def _names(views: Sequence[ViewReport]) -> str:
-    return f"view {listed([view.name for view in views])}"
+    return f"view {few([view.name for view in views], NAMED)}"
 
 
 def _span(views: Sequence[ViewReport], field: str, form: str) -> str:

@@ -20,12 +20,10 @@ import numpy as np
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import floats
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
+from humangs_jax.data.keypoints.keypoints import FINGER_JOINTS, FINGERS, Keypoints
 from humangs_jax.data.photos import load_photos, write_description
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
-from humangs_jax.fitting.similarity import Similarity
-from humangs_jax.fitting.triangulation import triangulate_robustly
+from humangs_jax.fitting.triangulation import Similarity, triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.atomic import check_replaceable, replace_folder
@@ -87,16 +85,16 @@ def read_mesh(path: str | Path, colors: bool = False) -> Any:
     return mesh
 
 
-def read_scan(path: str | Path, count: int = 30_000, seed: int = 0) -> Scan:
+def read_scan(path: str | Path, count: int = 30_000) -> Scan:
     """About `count` points of the outside of a mesh file. Raises: see `read_mesh`; ValueError if the surface has no area."""
     mesh = read_mesh(path)
     try:
-        return sample_scan(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), count, seed)
+        return sample_scan(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), count)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: int = 30_000, seed: int = 0) -> Scan:
+def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: int = 30_000) -> Scan:
     """Random points of a surface, uniform over its area.
 
     Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are detected.
@@ -108,7 +106,7 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     area = np.linalg.norm(across, axis=1)
     if not area.sum() > 0:
         raise ValueError("the faces have no area: expected a surface")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     ends = np.cumsum(area)
     total = OCCLUDERS * count
     face = np.minimum(np.searchsorted(ends, rng.random(total) * ends[-1], side="right"), len(faces) - 1)
@@ -268,7 +266,6 @@ def read_placement(file: Path) -> Similarity:
 
 
 def _into_world(vertices: Float[np.ndarray, "n 3"], up: str | None) -> Similarity:
-    """The similarity that stands a scan upright around the origin."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if up is not None and up not in AXES:
         raise ArgumentError("up", f"{up}: expected one of {', '.join(AXES)}")
@@ -287,7 +284,6 @@ def _draw(
     cameras: Camera,
     views: int,
 ) -> Iterator[View]:
-    """Images (h, w, 3) on white, shaded by a light at the camera, and masks (h, w)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

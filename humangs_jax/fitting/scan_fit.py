@@ -34,9 +34,8 @@ from humangs_jax.fitting.scan_search import (
     start_from_landmarks,
     start_state,
 )
-from humangs_jax.fitting.similarity import Similarity
-from humangs_jax.fitting.solve import Outcome
-from humangs_jax.fitting.state import scale_of
+from humangs_jax.fitting.state import Outcome, scale_of
+from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry import quaternion
 
 LANDMARK_STDS = (0.2, 0.1, 0.05, 0.02, 0.01)

@@ -20,7 +20,7 @@ from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.sets import mirrored_name
+from humangs_jax.data.keypoints.keypoints import mirrored_name
 from humangs_jax.fitting.landmark_fit import cube_rotations
 from humangs_jax.fitting.residuals.keypoints import trunk_weights
 from humangs_jax.fitting.residuals.scan import (
@@ -36,9 +36,8 @@ from humangs_jax.fitting.residuals.scan import (
     scan_residuals,
 )
 from humangs_jax.fitting.scan_files import Scan, directions_around
-from humangs_jax.fitting.similarity import Similarity, align_robustly
-from humangs_jax.fitting.solve import Outcome, half_squares, solve
-from humangs_jax.fitting.state import MIRROR, FitState, pose_prior, scale_of, state_of
+from humangs_jax.fitting.state import MIRROR, FitState, Outcome, half_squares, pose_prior, scale_of, solve, state_of
+from humangs_jax.fitting.triangulation import Similarity, align_robustly
 from humangs_jax.geometry import quaternion
 
 
@@ -208,7 +207,6 @@ def search_starts(surface: BodySurface, scan: Scan, kept: int) -> list[Start]:
 
 
 def _stances(joint_names: tuple[str, ...]) -> Iterator[Float[np.ndarray, "j 3"]]:
-    """(j, 3) rotations of each stance; joints that the body lacks are left out."""
     for turns in STANCES.values():
         rotations = pose_prior(joint_names).mean.copy()
         for name, turn in turns.items():

@@ -1,4 +1,4 @@
-"""One state for every fit: shape, poses and, where a fit moves them, cameras, clothing and the scale of a scan.
+"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras, clothing and the scale of a scan.
 
 A state holds deviations from an `Origin` in units of their expected size, so that zeros are the origin, solvers take steps of
 one length in all directions, and the square of a number is its prior.
@@ -14,20 +14,97 @@ The prior of poses is here, too: the usual rotation of every joint, its standard
 SMPL-X's joints by name, in radians about the axes of the T-pose: x to the person's left, y up, z forward. Limits are boxes of
 rotation vectors, generous where axes mix (hips, shoulders). Written for the left side; the right is its mirror image (x, -y, -z).
 A knee bends about +x, the left elbow about -y, left fingers about -z; the left arm hangs at z = -1.4.
+
+The solver minimises half the square sum of residuals over a pytree of numbers of about unit size; robust losses enter as
+residuals whose squares they are:
+
+    lbfgs   many unknowns, cheap under vmap; works through the renderer, which has a backward rule only
+    lm      Levenberg and Marquardt by normal equations: few unknowns, quadratic near the solution
 """
 
 import dataclasses
 import math
+from collections.abc import Callable
+from typing import Literal, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import EXACT, BodyPose
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera
+
+T = TypeVar("T")
+NORMAL_MAD = 1.4826
+"""Standard deviations of a normal distribution per median absolute deviation."""
+
+
+@pytree_dataclass
+class Outcome:
+    """What a solver did; () each, or a batch.
+
+    before, after: half the square sum. steps: taken. converged: False if it ran out of steps or found nothing better.
+    """
+
+    before: Float[Array, ""]
+    after: Float[Array, ""]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def half_squares(tree: PyTree) -> Float[Array, ""]:
+    """Half the square sum of all leaves."""
+    return sum((0.5 * jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
+
+
+def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Float[Array, "*n d"]:
+    """Residuals whose square is Geman and McClure's loss of the length of the errors: e c / sqrt(c^2 + |e|^2), c the scale.
+
+    Like e near 0, and no longer than c far off: a keypoint on another person pulls no harder than one that is a little off.
+    """
+    return errors * (scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True)))
+
+
+def solve(
+    residuals: Callable[[T], PyTree],
+    start: T,
+    steps: int,
+    *,
+    method: Literal["lbfgs", "lm"],
+    tolerance: float = 1e-4,
+    free: T | None = None,
+) -> tuple[T, Outcome]:
+    """Minimise from a start.
+
+    Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of the loss. free: pytree of
+    booleans like start; the others stay. Returns the solution, or the start where that is no worse, and so finite numbers.
+    """
+    import lineax
+    import optimistix
+
+    with jax.default_matmul_precision("highest"):  # the solvers' own products, too
+        flat, unravel = ravel_pytree(start)  # programs over one vector compile in half the time of those over trees
+        moving = None if free is None else ravel_pytree(free)[0]
+        hold = lambda y: y if moving is None else jnp.where(moving, y, flat)
+        of = lambda y: residuals(unravel(hold(y)))
+        if method == "lbfgs":
+            lbfgs = optimistix.LBFGS(tolerance, tolerance, history_length=20)
+            found = optimistix.minimise(lambda y, _: half_squares(of(y)), lbfgs, flat, max_steps=steps, throw=False)
+        else:
+            lm = optimistix.LevenbergMarquardt(tolerance, tolerance, linear_solver=lineax.Normal(lineax.Cholesky()))
+            vector = lambda y, _: ravel_pytree(of(y))[0]
+            found = optimistix.least_squares(vector, lm, flat, max_steps=steps, throw=False)
+        before, after = half_squares(of(flat)), half_squares(of(found.value))
+        better = after <= before  # False for NaN
+        converged = better & (found.result == optimistix.RESULTS.successful)
+        value = hold(jnp.where(better, found.value, flat))
+        return unravel(value), Outcome(before, jnp.where(better, after, before), jnp.asarray(found.stats["num_steps"]), converged)
+
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation."""
@@ -312,14 +389,11 @@ def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarra
     return np.asarray([of(j) for j in range(len(parents))], np.int32)
 
 
-def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"], shared_focal: bool) -> CameraOrigin:
-    """Cameras as they are: views of equal K and cam_from_world are of one camera that stood still.
-
-    Arguments: shared_focal: focal lengths that are equal stay equal; otherwise each camera has its own.
-    """
+def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigin:
+    """Cameras as they are: views of equal K and cam_from_world are of one camera that stood still. So are equal focal lengths."""
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
-    focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME) if shared_focal else camera
+    focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)
     return CameraOrigin(cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames)))
 
 

@@ -25,8 +25,7 @@ import numpy as np
 from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import KeypointSet
+from humangs_jax.data.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations
 from humangs_jax.fitting.state import camera_numbers

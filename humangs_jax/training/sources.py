@@ -17,9 +17,16 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import inexact_leaves
 from humangs_jax.data.capture import DEFAULT_BODY
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.subject import open_people
-from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, Mixture, PeopleCache, Source
+from humangs_jax.data.datasets.subject import FileBody, open_people
+from humangs_jax.data.loading import (
+    CaptureCache,
+    CaptureSource,
+    Example,
+    Loader,
+    Mixture,
+    PeopleCache,
+    Source,
+)
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
 from humangs_jax.people.subject import SPLITS

@@ -13,9 +13,9 @@ from humangs_jax.apps import detect
 from humangs_jax.apps.detect import Found, PhotoPeople, choose, person_mask, same_people, write_found
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.own import SeenPerson, read_people
+from humangs_jax.data.keypoints.formats import SeenPerson, read_people
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.io.images import read_grey, write_png
 
 SIZE = (40, 30)

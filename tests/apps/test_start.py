@@ -20,10 +20,10 @@ from humangs_jax.cli.start import Start
 from humangs_jax.data import capture as capture_module
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.own import SeenPerson
-from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.keypoints.formats import SeenPerson
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
-from humangs_jax.detection import blazepose
+from humangs_jax.detection import people as blazepose
 from humangs_jax.fitting import fit_capture
 from humangs_jax.io.images import read_image, to_uint8, write_png
 

@@ -10,7 +10,7 @@ from changes import edit_json
 
 from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
-from humangs_jax.data.calibration.opencv import parse_file_storage
+from humangs_jax.data.calibration.rigs import parse_file_storage
 from humangs_jax.data.capture_checks import CaptureError
 from tests.data import calibration_files as written
 

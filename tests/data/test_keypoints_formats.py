@@ -7,10 +7,8 @@ import pytest
 from changes import edit_json
 
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, read_people, save_keypoints, write_people
-from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.keypoints.sets import (
+from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, read_people, save_keypoints, write_people
+from humangs_jax.data.keypoints.keypoints import (
     COCO_17,
     COCO_WHOLEBODY_133,
     HALPE_26,
@@ -18,7 +16,9 @@ from humangs_jax.data.keypoints.sets import (
     KEYPOINT_SETS,
     MEDIAPIPE_33,
     OPENPOSE_67,
+    Keypoints,
 )
+from humangs_jax.data.keypoints.reading import read_keypoints
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
 CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")

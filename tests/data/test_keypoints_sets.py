@@ -1,6 +1,6 @@
 import pytest
 
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, MEDIAPIPE_33, OPENPOSE_67, hand_names
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, MEDIAPIPE_33, OPENPOSE_67, hand_names
 
 
 @pytest.mark.parametrize("keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67), (MEDIAPIPE_33, 33)])

@@ -14,19 +14,9 @@ from hypothesis import strategies as st
 from small import small_body
 
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.loading import (
-    CaptureCache,
-    CaptureSource,
-    Loader,
-    StoredSubject,
-    ViewSampling,
-    draw_views,
-    find_captures,
-    nearest_view,
-    shrink,
-    subject_order,
-)
-from humangs_jax.data.loading.captures import read_summary
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.loading.captures import find_captures, read_summary
+from humangs_jax.data.loading.examples import StoredSubject, draw_views, nearest_view, shrink, subject_order
 from humangs_jax.data.photos import read_view
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png

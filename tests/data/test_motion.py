@@ -16,8 +16,7 @@ from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.cli import animate
 from humangs_jax.core.registry import imported
 from humangs_jax.data.formats import MOTIONS, MotionFormat
-from humangs_jax.data.motion import PELVIS, UPRIGHT, Motion, MotionError, grounded, load_motion, save_motion
-from humangs_jax.data.motion.motion import Poses
+from humangs_jax.data.motion import PELVIS, UPRIGHT, Motion, MotionError, Poses, grounded, load_motion, save_motion
 from humangs_jax.geometry import quaternion
 
 FLOAT32 = 1e-5

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import PELVIS, UPRIGHT, MotionError, load_motion
-from humangs_jax.data.motion.mhr import COUNT, JOINTS
+from humangs_jax.data.motion.arrays import RIG, RIG_JOINTS
 from humangs_jax.data.motion.rules import joint_places
 from humangs_jax.data.motion.skeleton import shipped_joints
 
@@ -320,12 +320,12 @@ def mhr(rots=True, frames=FRAMES):
     """SAM 3D Body's joints of the shipped body, with bones that have turns of their own at rest."""
     places = joint_places(shipped_joints(), ROTATIONS, PLACES) * [1, -1, -1]
     world = Rotation.from_rotvec(ROTATIONS.reshape(-1, 3)).as_matrix().reshape(FRAMES, 55, 3, 3)
-    points, turns = np.zeros((FRAMES, COUNT, 3)), np.tile(np.eye(3), (FRAMES, COUNT, 1, 1))
-    own = Rotation.random(COUNT, random_state=2).as_matrix()
+    points, turns = np.zeros((FRAMES, RIG_JOINTS, 3)), np.tile(np.eye(3), (FRAMES, RIG_JOINTS, 1, 1))
+    own = Rotation.random(RIG_JOINTS, random_state=2).as_matrix()
     at = np.array([0, 1.0, 4])
     for j, p in enumerate(PARENTS):
         world[:, j] = world[:, j] if p < 0 else world[:, p] @ world[:, j]
-    for joint, (name, _) in JOINTS.items():
+    for joint, (name, _) in RIG.items():
         j = JOINT_NAMES.index(name if name != "spine0" else "pelvis")
         points[:, joint], turns[:, joint] = places[:, j] - at, world[:, j] @ own[joint]
     found = {"pred_joint_coords": points, "pred_cam_t": np.tile(at, (FRAMES, 1)), "pred_vertices": np.zeros((FRAMES, 4, 3))}

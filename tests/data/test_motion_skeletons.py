@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import MotionError, load_motion
-from humangs_jax.data.motion.bvh import read_bvh
+from humangs_jax.data.motion.clips import read_bvh
 from humangs_jax.data.motion.skeleton import retargeted, shipped_joints
 from humangs_jax.io.mesh import GlbWriter
 

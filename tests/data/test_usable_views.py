@@ -10,7 +10,7 @@ import pytest
 from humangs_jax.apps.settings import Settings
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.usable_views import _sampling, shares_on_masks, usable_indices, usable_views
+from humangs_jax.data.usable_views import _sampling, shares_on_masks, usable_views
 from humangs_jax.data.views import select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
 
@@ -61,14 +61,10 @@ def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
     assert f"1 of 4 views is left out: {demo.names[1]}: " in record.getMessage() and reason in record.getMessage()
 
 
-@pytest.mark.parametrize("mask", KEPT)
+@pytest.mark.parametrize("mask", [*KEPT, None])
 def test_other_masks_are_kept(demo, mask):
-    capture = with_mask(demo, 1, KEPT[mask](demo.masks[1]))
+    capture = dataclasses.replace(demo, masks=None) if mask is None else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
     assert usable_views(capture) is capture
-
-
-def test_without_masks_all_views_are_kept(demo):
-    assert usable_indices(dataclasses.replace(demo, masks=None)) == [0, 1, 2, 3]
 
 
 def test_exact_masks_hold_the_body(demo):

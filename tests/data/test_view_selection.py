@@ -75,7 +75,7 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
     matrices[::2, 2, 3] += away
     capture = dataclasses.replace(doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices)))
     body = decimate(capture.body, module.SELECTION_VERTICES)
-    quality = np.asarray(module._quality(body, standardize(capture, module.SELECTION_SIZE)))
+    quality = np.asarray(module.view_quality(body, standardize(capture, module.SELECTION_SIZE)))
     for far, near in ((0, 1), (2, 3)):
         both = (quality[far] > 0) & (quality[near] > 0)
         distance = matrices[near, 2, 3]
@@ -92,5 +92,5 @@ def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
         assert area[small].sum() < area[~small].sum()
         return np.stack([small, ~small]).astype(float)
 
-    monkeypatch.setattr(module, "_quality", quality)
+    monkeypatch.setattr(module, "view_quality", quality)
     assert select_views(demo.select([0, 1]), 1) == [1]

@@ -1,6 +1,6 @@
 import pytest
 
-from humangs_jax.detection.blazepose import Networks
+from humangs_jax.detection.people import Networks
 
 
 @pytest.fixture(scope="session")

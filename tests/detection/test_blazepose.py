@@ -5,7 +5,7 @@ import importlib
 import numpy as np
 import pytest
 
-from humangs_jax.detection.blazepose import (
+from humangs_jax.detection.people import (
     ENLARGED,
     Crop,
     Detection,
@@ -14,12 +14,13 @@ from humangs_jax.detection.blazepose import (
     _anchors,
     _merged,
     bilinear,
+    distinct,
     mask_at,
     mask_in_photo,
     refined,
     sampled,
+    windows,
 )
-from humangs_jax.detection.people import distinct, windows
 
 ROUNDING = 1e-9
 """Of float64 pixels up to some thousands."""

@@ -7,8 +7,7 @@ from scipy import ndimage
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.data.capture import load_capture
-from humangs_jax.detection.blazepose import ENLARGED, Detection, Landmarks, Networks
-from humangs_jax.detection.people import detect_people, sharpened
+from humangs_jax.detection.people import ENLARGED, Detection, Landmarks, Networks, detect_people, sharpened
 from humangs_jax.io.images import resized
 
 PARTS = {"shoulder": 11, "elbow": 13, "wrist": 15, "hip": 23, "knee": 25, "ankle": 27}

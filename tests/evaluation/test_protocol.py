@@ -8,7 +8,7 @@ import pytest
 from evaluation_cases import ellipse
 from scipy import ndimage
 
-from humangs_jax.cli.evaluate import Evaluate
+from humangs_jax.cli.training import Evaluate
 from humangs_jax.evaluation.scores import (
     PROTOCOLS,
     CentredWindow,

@@ -10,7 +10,7 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.fitting.residuals.keypoints import make_observations
 from humangs_jax.fitting.state import MIRROR
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit

@@ -6,7 +6,7 @@ from fit_people import betas_of, model_of, rotations_of
 
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyPose
-from humangs_jax.data.keypoints.sets import SIDES, mirrored_name
+from humangs_jax.data.keypoints.keypoints import SIDES, mirrored_name
 from humangs_jax.fitting.person_cameras import PersonViews
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 

@@ -10,8 +10,7 @@ from fit_people import default_body as body
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.fitting.state import pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 

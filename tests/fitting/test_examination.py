@@ -11,7 +11,7 @@ from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.fit_capture import examine, examine_record
 from humangs_jax.fitting.report import (
@@ -22,7 +22,6 @@ from humangs_jax.fitting.report import (
     FitReport,
     ViewReport,
     keypoint_warnings,
-    listed,
     undetermined_joints,
 )
 from humangs_jax.fitting.swaps import Swap
@@ -204,7 +203,6 @@ def test_warnings_stay_few():
     assert found[NAMED] == "7 more views or pairs of views seem exchanged"
     assert found[NAMED + 1].endswith("in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px")
     assert found[NAMED + 2] == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
-    assert listed(["a", "b"]) == "a, b"
 
 
 # Of what a fit kept --------------------------------------------------------------------------------------------------

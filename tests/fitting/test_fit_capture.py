@@ -11,8 +11,7 @@ from fit_people import NAMES_WITHIN_LIMITS, default_body, observe
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133, Keypoints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting import files, fit_capture
 from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted

@@ -11,9 +11,9 @@ from humangs_jax.body.landmarks import kind_of, landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.keypoints.own import ImagePeople, SeenPerson, write_people
+from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, write_people
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67
 from humangs_jax.fitting import landmark_fit
 from humangs_jax.fitting.fit_capture import fit_uncertainty
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks

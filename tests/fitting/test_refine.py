@@ -14,8 +14,7 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.fitting import refine as module
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, Score, refine_capture, start_state, usual_config
 from humangs_jax.fitting.residuals.silhouettes import (

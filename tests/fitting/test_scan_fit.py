@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting.files import save_scan_fit
 from humangs_jax.fitting.residuals.scan import (
@@ -38,8 +37,8 @@ from humangs_jax.fitting.scan_files import (
 )
 from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
 from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts, start_state
-from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.state import pose_prior
+from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.mesh import GREY

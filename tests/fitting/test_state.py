@@ -22,7 +22,6 @@ from humangs_jax.fitting.landmark_fit import FitConfig, keypoint_problem
 from humangs_jax.fitting.refine import CaptureRefineConfig, capture_origin, moved_capture
 from humangs_jax.fitting.residuals import scan, silhouettes
 from humangs_jax.fitting.residuals.keypoints import Observations, frame_residuals
-from humangs_jax.fitting.solve import solve
 from humangs_jax.fitting.state import (
     MIRROR,
     RANGES,
@@ -36,6 +35,7 @@ from humangs_jax.fitting.state import (
     pose_of,
     pose_prior,
     segments,
+    solve,
     state_of,
     usual_origin,
     violations,
@@ -84,13 +84,11 @@ def moved(state, **changes):
     return replace(state, cameras=replace(state.cameras, **changes))
 
 
-def test_views_by_one_camera_share_it_and_equal_focal_lengths_are_one_unless_told_otherwise(capture):
-    of = lambda cameras, shared: camera_origin(cameras, capture.frames, shared)
-    assert of(capture.cameras, True).camera.tolist() == [0, 1, 0]
-    assert of(capture.cameras, True).focal.tolist() == [0, 0, 0]
-    assert of(capture.cameras, False).focal.tolist() == [0, 1, 0]
+def test_views_by_one_camera_share_it_and_equal_focal_lengths_are_one(capture):
     zoomed = replace(capture.cameras, K=capture.cameras.K.at[1, 0, 0].multiply(1.01))
-    assert of(zoomed, True).focal.tolist() == [0, 1, 0]
+    own, other = (camera_origin(cameras, capture.frames) for cameras in (capture.cameras, zoomed))
+    assert own.camera.tolist() == other.camera.tolist() == other.focal.tolist() == [0, 1, 0]
+    assert own.focal.tolist() == [0, 0, 0]
 
 
 def test_zeros_are_the_origin_with_the_shape_filled_up(capture, origin):
@@ -296,7 +294,7 @@ MOVED = Origin(
     betas=jnp.zeros(1),
     pose=jax.vmap(BodyPose)(jnp.zeros((1, J, 3)), jnp.zeros((1, 3))),
     body_pose_std=jnp.ones((J - 1, 3)),
-    cameras=camera_origin(camera.stack_cameras([CAMERA]), np.zeros(1, np.int32), False),
+    cameras=camera_origin(camera.stack_cameras([CAMERA]), np.zeros(1, np.int32)),
     segment=jnp.asarray(segments(MODEL.parents, (1, 2, 3))),
     joints=(1, 2, 3),
 )

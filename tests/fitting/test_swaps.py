@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from seen_people import person
 
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, hand_names
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, Keypoints, hand_names
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting import swaps as module
 from humangs_jax.fitting.landmark_fit import FitConfig

@@ -7,8 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting import triangulation
-from humangs_jax.fitting.similarity import Similarity, align_points, align_robustly
-from humangs_jax.fitting.triangulation import reprojection_errors, triangulate, triangulate_robustly
+from humangs_jax.fitting.triangulation import (
+    Similarity,
+    align_points,
+    align_robustly,
+    reprojection_errors,
+    triangulate,
+    triangulate_robustly,
+)
 
 EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres
 KNOWN = np.asarray(model_of().known)

@@ -14,7 +14,7 @@ from PIL import Image
 from small import tetrahedron
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.fitting.files import KEYS
 from humangs_jax.io.mesh import GlbWriter

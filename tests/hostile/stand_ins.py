@@ -30,14 +30,13 @@ from humangs_jax.body.model import BodyPose, shape_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, save_capture
-from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.evaluation.scores import Scores, score_names
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.refine import RefinedCapture
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.network.presets import tiny
@@ -211,7 +210,7 @@ def stand_ins(variant):
         "avatar.frames.motion_views": lambda *_: (None, None),
         "avatar.frames.turntable_views": lambda _avatar, _pose, views, _shot: ([None] * views, some_cameras(views)),
         "avatar.layers.draw": lambda _, poses, *__: iter(some_renderings(variant, len(poses))),
-        "detection.blazepose.available": lambda: False,
+        "detection.people.available": lambda: False,
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: ((), (SimpleNamespace(problem=None, inside=1.0),) * capture.view_count),
         "apps.check._posed_frames": lambda capture, *_: {0: np.zeros((4, 3))},

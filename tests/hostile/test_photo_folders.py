@@ -18,7 +18,7 @@ from humangs_jax import cli
 from humangs_jax.apps import detect
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.keypoints.own import read_people
+from humangs_jax.data.keypoints.formats import read_people
 from humangs_jax.detection.people import detect_people
 from humangs_jax.io.images import read_grey, resized, to_uint8
 

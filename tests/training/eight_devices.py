@@ -56,7 +56,8 @@ def a_training_step():
     one device that works on all 8 at once."""
     from training_cases import tube, write_subject
 
-    from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader, find_captures
+    from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
+    from humangs_jax.data.loading.captures import find_captures
     from humangs_jax.losses.loss_networks import LossNetworks
     from humangs_jax.network.humangs import init_humangs
     from humangs_jax.training.config import tiny

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from training_cases import source_of
 
-from humangs_jax.data.loading import CaptureCache, Loader, Waiting, subject_order
+from humangs_jax.data.loading import CaptureCache, Loader, Waiting
+from humangs_jax.data.loading.examples import subject_order
 from humangs_jax.io.reading import FileError
 from humangs_jax.training.config import tiny
 from humangs_jax.training.loop import MANY_SKIPPED, RunLog, Watch, forget_after

@@ -59,7 +59,7 @@ def main():
         join_processes(arguments.coordinator, arguments.processes, arguments.process)
     from training_cases import tube
 
-    from humangs_jax.data.loading import find_captures
+    from humangs_jax.data.loading.captures import find_captures
     from humangs_jax.training.loop import TrainingInterrupted, train
 
     logging.basicConfig(level=logging.WARNING)

@@ -28,7 +28,7 @@ from scipy.special import expit
 from humangs_jax.avatar.export.gaussians import colors_of, linear_of, loaded, plain_arrays, sh_of, with_largest
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.core.checks import checked_arguments
-from humangs_jax.data.motion.gltf import node_matrices
+from humangs_jax.data.motion.clips import node_matrices
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
 from humangs_jax.io.reading import Refused, check_limit, check_unpacked, shown

@@ -20,17 +20,20 @@ from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
     CalibratedCamera,
     Calibration,
+    Checks,
     PixelCenters,
+    check_calibration,
     in_capture_convention,
     read_calibration,
     undistort,
 )
-from humangs_jax.data.calibration.checks import Checks, check_calibration, check_masks, has_alpha
 from humangs_jax.data.calibration.photos import (
     Photo,
     Turn,
+    check_masks,
     find_photos,
     find_turns,
+    has_alpha,
     photo_of,
     photo_size,
     turn_notes,
@@ -261,7 +264,6 @@ def _by(width: int, height: int) -> str:
 
 
 def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> tuple[str, ...]:
-    """What was done to photos of several sizes, a line."""
     counts = Counter(turn.size for turn in turns)
     if set(counts) == {canvas}:
         return ()
@@ -313,7 +315,6 @@ def _of_phones(photo: Photo) -> bool:
 
 
 def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
-    """The files as they are; their paths for capture.json."""
     files = {"image": f"images/{name}{photo.image.suffix}"}
     shutil.copyfile(photo.image, folder / files["image"])
     if photo.mask is not None:
@@ -323,7 +324,6 @@ def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
 
 
 def _is_transparent(photo: Path) -> bool:
-    """Whether any pixel is."""
     if not read_checked(has_alpha, photo):
         return False
     alpha = read_checked(read_image, photo)[1]

@@ -1,4 +1,4 @@
-"""Which photo belongs to which camera and to which frame, by file names; and which way up it is, by its EXIF orientation.
+"""Which photo belongs to which camera and to which frame, by file names; which way up it is, by its EXIF orientation; its mask.
 
 Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it. What an import writes has none:
 pixels are turned upright, and with them the camera, if it was calibrated for the pixels as stored (COLMAP). A calibration of the
@@ -12,11 +12,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, few
-from humangs_jax.data.photos import read_checked
-from humangs_jax.io.images import image_size, orientation, oriented
+from humangs_jax.data.photos import read_checked, read_mask
+from humangs_jax.data.usable_views import MASK_THRESHOLD
+from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
 from humangs_jax.io.reading import inside, reading
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
@@ -52,7 +53,7 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
     photos = []
     for camera, frame, image in found:
         key = image.relative_to(images).with_suffix("").as_posix()
-        mask = named.get(camera) if masks is None else _mask(masks, images, image)
+        mask = named.get(camera) if masks is None else _mask_file(masks, images, image)
         photos.append(Photo(image, mask, camera, frame, key))
     return tuple(photos)
 
@@ -119,7 +120,6 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def _of_images(images: Path, names: Sequence[str], file: Path) -> list[tuple[int, Path]]:
-    """(camera, photo) where each image has a camera of its own."""
     photos: dict[Path, str] = {}
     for name in names:
         photo = photo_of(images, name, file)
@@ -129,7 +129,7 @@ def _of_images(images: Path, names: Sequence[str], file: Path) -> list[tuple[int
     return list(enumerate(photos))
 
 
-def _mask(masks: Path, images: Path, image: Path) -> Path:
+def _mask_file(masks: Path, images: Path, image: Path) -> Path:
     """The mask at the same path in the folder of masks (COLMAP: with one more suffix); AvatarReX: in mask/pha beside the photo.
 
     AvatarReX has photos and masks in one folder, so that the photo itself can be what is found first.
@@ -142,7 +142,6 @@ def _mask(masks: Path, images: Path, image: Path) -> Path:
 
 
 def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
-    """(camera, frame, photo) where each camera took one photo or several."""
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         _check_inside(images, name)
@@ -166,7 +165,6 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 
 
 def _photos_in(folder: Path) -> dict[str, Path]:
-    """By name without suffix."""
     entries = os.scandir(folder) if folder.is_dir() else ()
     return {Path(e.name).stem: Path(e.path) for e in entries if is_photo(Path(e.name)) and e.is_file()}
 
@@ -333,3 +331,63 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[tuple[st
     if mirrored:
         warnings.append(f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so")
     return tuple(notes), tuple(warnings)
+
+
+# Masks ----------------------------------------------------------------------------------------------------------------
+
+AROUND = 0.8
+"""Share of a photo's border that no person covers: a mask that does is inverted."""
+EMPTY = "the mask is empty, the photo will be left out"
+FULL = "the mask covers the whole photo: is nothing of it background?"
+INVERTED = "the mask covers the border of the photo: is it inverted? expected 255 where the person is"
+
+
+def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
+    """Warnings about masks, files or alpha channels, one line for each kind of fault, naming the photos.
+
+    Raises: CaptureError for a mask that no capture may have, for masks none of which shows anybody, and, where there are no mask
+    files, for an alpha channel in some of the photos only.
+    """
+    masked = photos[0].mask is not None
+    if not masked:
+        alphas = [read_checked(has_alpha, photo.image) for photo in photos]
+        if not any(alphas):
+            return ()
+        if not all(alphas):
+            file = photos[alphas.index(False)].image
+            raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
+    found: dict[str, list[str]] = {}
+    opaque = True
+    for photo in photos:
+        mask = _mask(photo)
+        opaque = opaque and mask.min() == 1
+        if (problem := _problem(mask > MASK_THRESHOLD)) is not None:
+            found.setdefault(problem, []).append((photo.mask or photo.image).name)
+    if not masked and opaque:
+        return ()  # many programs write an opaque alpha channel: it says nothing
+    if len(found.get(EMPTY, ())) == len(photos):
+        first = photos[0].mask or photos[0].image
+        raise CaptureError(first, "mask", "empty, as are all of them: expected 255 where the person is")
+    return tuple(f"{problem}: {few(names)}" for problem, names in found.items())
+
+
+def _mask(photo: Photo) -> Float[np.ndarray, "h w"]:
+    if photo.mask is None:
+        return read_checked(read_image, photo.image)[1]
+    width, height = read_checked(image_size, photo.mask)
+    return read_mask(photo.mask, "its photo", width, height)
+
+
+def _problem(person: Bool[np.ndarray, "h w"]) -> str | None:
+    if not person.any():
+        return EMPTY
+    if person.all():
+        return FULL
+    border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
+    return INVERTED if border.mean() > AROUND else None
+
+
+def has_alpha(photo: Path) -> bool:
+    """Whether a photo has an alpha channel, opaque or not."""
+    with open_image(photo) as (image, _):
+        return "A" in image.getbands() or "transparency" in image.info

@@ -160,7 +160,6 @@ def _run(path: Path, folder: Path, select: str, most: int) -> int:
 
 
 def _finished(path: Path, command: Sequence[str], folder: Path | None = None) -> bytes:
-    """What ffmpeg writes to its standard output."""
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
     except subprocess.TimeoutExpired:
@@ -171,7 +170,6 @@ def _finished(path: Path, command: Sequence[str], folder: Path | None = None) ->
 
 
 def _said(path: Path, text: bytes) -> ValueError:
-    """The error that ffmpeg tells of."""
     said = " ".join(text.decode(errors="replace").split()) or "no frame"
     return ValueError(said.replace(f"file:{path.resolve()}", path.name))
 

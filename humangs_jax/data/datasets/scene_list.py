@@ -19,8 +19,17 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, checked_numbers, open_arrays, recover_pose, recover_shape
-from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
+from humangs_jax.data.datasets.subject import (
+    STORED_SIZE,
+    BodyParameters,
+    FileBody,
+    Person,
+    Subject,
+    checked_numbers,
+    open_arrays,
+    recover_pose,
+    recover_shape,
+)
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_grey, read_image
@@ -92,7 +101,6 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
 
 
 def _first_size(file: Path, scenes: Mapping[str, dict[str, Any]]) -> int:
-    """Side of the first image that is there."""
     for name, scene in scenes.items():
         for frame in _frames(scene, file, name)[:1]:
             path = file.parent / str(frame.get("image_path", ""))

@@ -1,26 +1,211 @@
-"""One person of a data set: arrays of all views at once, photos and poses only when they are asked for.
+"""One person of a data set, and the body of the data set: its model file, parameters, what a pose makes of it.
 
 A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration and body parameters, so that a
-sequence of 5,000 frames opens in well under a second. Photos come on white, padded to a centred square and resized.
+sequence of 5,000 frames opens in well under a second. Photos come on white, padded to a centred square and resized. Values of
+files are checked one by one (`open_arrays`, `checked_numbers`): a fault is a `CaptureError` that names file and key.
 """
 
 import concurrent.futures
 import dataclasses
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.body.library import HandBasis, load_body, load_hands
+from humangs_jax.body.model import BodyModel, BodyPose, PosedBody, RestBody, pose_body, shape_body
+from humangs_jax.core.array_types import Bool, Float, Int, UInt8
 from humangs_jax.core.registry import imported
-from humangs_jax.data.capture import Capture, capture_from_arrays
-from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody
+from humangs_jax.data.capture import DEFAULT_BODY, Capture, capture_from_arrays
+from humangs_jax.data.capture_checks import CaptureError, file_numbers, shape_coefficients
 from humangs_jax.data.formats import DATASETS
 from humangs_jax.data.loading.examples import StoredSubject
+from humangs_jax.io import arrays as array_files
 from humangs_jax.io.images import resized, to_uint8
+
+LARGEST_ANGLE = 4 * np.pi
+"""Radians of a rotation vector; fits wander beyond 2 pi now and then, degrees are far above."""
+FARTHEST = 100.0
+"""Metres of a translation or of a camera from the origin; millimetres are far above."""
+LARGEST_COEFFICIENT = 30.0
+"""Of shape and expression: standard deviations, usually below 5."""
+
+open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
+checked_numbers = functools.partial(file_numbers, some=True)
+
+FIRST_HAND_JOINT = 25
+"""In the order of SMPL-X: 30 finger joints follow."""
+RECOVERED_TOLERANCE = 3e-3
+"""Metres, root mean square over vertices, up to which arrays of a scene list are those of a body model."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FileBody:
+    """The body model that the parameters of a data set belong to, and the file that it was read from."""
+
+    model: BodyModel
+    file: str = DEFAULT_BODY
+
+    @classmethod
+    def load(cls, file: str | Path | None = None) -> "FileBody":
+        """A model file, or (None) the body that comes with the package. Raises: as `load_body`."""
+        return cls(load_body(file), DEFAULT_BODY if file is None else str(file))
+
+    @functools.cached_property
+    def hands(self) -> HandBasis:
+        """Mean and components of its hand poses. Raises: CaptureError for the package's own body, which has none."""
+        if self.file == DEFAULT_BODY:
+            problem = "these hand poses are relative to SMPL-X's mean hand: expected the path of an SMPL-X model for body"
+            raise CaptureError("body", DEFAULT_BODY, problem)
+        return load_hands(self.file)
+
+    @functools.cached_property
+    def arrays(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
+        """Template, shape directions and joint regressor, float64."""
+        model = self.model
+        template, directions, regressor = model.template, model.shape_directions, model.joint_regressor
+        return tuple(np.asarray(x, np.float64) for x in (template, directions, regressor))  # ty: ignore[invalid-explicit-return]
+
+    def rest_joints(self, betas: Float[np.ndarray, " s"]) -> Float[np.ndarray, "j 3"]:
+        """Where the joints of a person are in the T-pose, metres."""
+        template, directions, regressor = self.arrays
+        return regressor @ (template + directions[..., : len(betas)] @ betas)
+
+
+class BodyParameters(NamedTuple):
+    """Shape and poses of a person: coefficients (s,), axis-angle (m, j, 3) radians, translations (m, 3) metres."""
+
+    betas: Float[np.ndarray, " s"]
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+
+    def poses(self, rows: Sequence[int]) -> "BodyParameters":
+        """The shape with these poses alone."""
+        index = np.asarray(rows, int)
+        return BodyParameters(self.betas, self.rotations[index], self.translations[index])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PosedPerson:
+    """What a pose makes of a person.
+
+    rest: (n, 3) T-pose. vertices: (n, 3), joints: (j, 3) and joint_transforms: (j, 4, 4), rest -> posed, translation included.
+    """
+
+    rest: Float[np.ndarray, "n 3"]
+    vertices: Float[np.ndarray, "n 3"]
+    joints: Float[np.ndarray, "j 3"]
+    joint_transforms: Float[np.ndarray, "j 4 4"]
+
+
+@jax.jit
+def _posed(body: BodyModel, betas: Any, rotations: Any, translation: Any) -> tuple[RestBody, PosedBody]:
+    rest = shape_body(body, betas)
+    return rest, pose_body(body, rest, BodyPose(rotations, translation))
+
+
+def posed_people(body: BodyModel, parameters: BodyParameters, scale: float = 1.0) -> Iterator[PosedPerson]:
+    """A person in one pose after the other, all lengths times `scale`."""
+    for rotations, translation in zip(parameters.rotations, parameters.translations, strict=True):
+        rest, posed = _posed(body, *(jnp.asarray(x, jnp.float32) for x in (parameters.betas, rotations, translation)))
+        lengths = (scale * np.asarray(x, np.float64) for x in (rest.vertices, posed.vertices, posed.joints))
+        transforms = np.array(posed.joint_transforms, np.float64)
+        transforms[:, :3, 3] *= scale
+        yield PosedPerson(*lengths, transforms)
+
+
+def coefficients(
+    body: BodyModel, betas: Float[np.ndarray, " s"], expression: Float[np.ndarray, " e"], file: object
+) -> Float[np.ndarray, " all"]:
+    """Coefficients of all of the body's directions: shape, then expression. Those that a file has not are 0.
+
+    Raises: CaptureError for more numbers than the body has directions, unless they are 0; and for a body whose directions mean
+    something else than SMPL-X's.
+    """
+    if not any(name.startswith("shape_") for name in body.shape_names):
+        problem = f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model for body"
+        raise CaptureError(file, "betas", problem)
+    names = [f"{kind}_{i}" for kind, values in (("shape", betas), ("expression", expression)) for i in range(len(values))]
+    found = shape_coefficients(body, np.concatenate([betas, expression]), names, file)
+    return np.pad(found, (0, body.shape_directions.shape[-1] - len(found)))
+
+
+def turned(parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]) -> BodyParameters:
+    """The same poses in a world that a rigid transform moved. pelvis: (3,) its place in the T-pose of the person."""
+    from scipy.spatial.transform import Rotation
+
+    R, t = matrix[:3, :3], matrix[:3, 3]
+    rotations = parameters.rotations.copy()
+    rotations[:, 0] = (Rotation.from_matrix(R) * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
+    # the root turns about the pelvis: x -> W (x - p) + p + transl
+    translations = (parameters.translations + pelvis) @ R.T + t - pelvis
+    return BodyParameters(parameters.betas, rotations, translations)
+
+
+def recover_shape(body: FileBody, rest: Float[np.ndarray, "n 3"], file: object) -> tuple[float, Float[np.ndarray, " s"]]:
+    """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template + directions betas).
+
+    Where all vertices do not fit, the hands are left out, which the release bends by accident.
+    Raises: CaptureError if the arrays are not of this body.
+    """
+    template = body.arrays[0]
+    if len(rest) != len(template):
+        problem = f"{len(rest)} vertices, but body '{body.model.name}' has {len(template)}: expected the model of the arrays"
+        raise CaptureError(file, "v_cano", problem)
+    for solve, columns, kept in _shape_solvers(body):
+        solution = solve @ rest[kept].reshape(-1)
+        scale = float(solution[0])
+        missed = (columns @ solution - rest[kept].reshape(-1)).reshape(-1, 3)
+        error = float(np.sqrt((missed**2).sum(axis=1).mean())) / max(abs(scale), 1e-12)
+        if scale > 0 and error < RECOVERED_TOLERANCE:
+            return scale, solution[1:] / scale
+    problem = f"{1e3 * error:.3g} mm from body '{body.model.name}': expected the model that the arrays were made with"
+    raise CaptureError(file, "v_cano", problem)
+
+
+@functools.lru_cache(maxsize=2)
+def _shape_solvers(
+    body: FileBody,
+) -> tuple[tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...]:
+    """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of all vertices, then
+    without the hands.
+    """
+    template, directions, _ = body.arrays
+    of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6
+    solvers = []
+    for kept in (np.ones(len(template), bool), ~of_hands):
+        columns = np.concatenate([template[..., None], directions], axis=-1)[kept]
+        columns = columns.reshape(-1, columns.shape[-1])
+        solvers.append((np.linalg.pinv(columns), columns, kept))
+    return tuple(solvers)
+
+
+def recover_pose(
+    body: FileBody, betas: Float[np.ndarray, " s"], scale: float, transforms: Float[np.ndarray, "j 4 4"], file: object
+) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
+    """Rotations and translation (metres) of a person from `joint_transforms`, which take the scaled T-pose to the pose.
+
+    Raises: CaptureError if one of them is no rotation.
+    """
+    from scipy.spatial.transform import Rotation
+
+    R = transforms[:, :3, :3]
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    if (worst := int(off.argmax())) is not None and (off[worst] > 1e-3 or (np.linalg.det(R) < 0).any()):
+        raise CaptureError(file, "joint_transforms", f"number {worst} is no rotation: R R^T must be 1 and det R = 1")
+    parents = np.asarray(body.model.parents)
+    above = np.where((parents < 0)[:, None, None], np.eye(3), R[np.maximum(parents, 0)])
+    rotations = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ R).as_rotvec()
+    pelvis = body.rest_joints(betas)[0]
+    return rotations, transforms[0, :3, 3] / scale - pelvis + R[0] @ pelvis
+
+
+# Subjects --------------------------------------------------------------------------------------------------------------
 
 STORED_SIZE = 512
 """Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it."""
@@ -140,21 +325,9 @@ class Person:
     def summary(self) -> StoredSubject:
         """All of it but pixels and poses."""
         subject, every = self.subject, np.arange(len(self.subject))
-        R, t = subject.cam_from_world[:, :3, :3], subject.cam_from_world[:, :3, 3]
-        centers = -np.einsum("vji,vj->vi", R, t)
-        offsets = centers - centers.mean(axis=0)
-        betas, rotations, translations = subject.parameters([])
-        return StoredSubject(
-            images=np.zeros((0, self.size, self.size, 3), np.uint8),
-            masks=np.zeros((0, self.size, self.size), np.uint8),
-            K=subject.squared_K(every, self.size).astype(np.float32),
-            cam_from_world=subject.cam_from_world.astype(np.float32),
-            frames=subject.frames,
-            azimuths=np.arctan2(offsets[:, 0], offsets[:, 2]),
-            rotations=rotations.astype(np.float32),
-            translations=translations.astype(np.float32),
-            betas=betas.astype(np.float32),
-        )
+        betas, *poses = subject.parameters([])
+        K = subject.squared_K(every, self.size)
+        return StoredSubject.without_photos((self.size, self.size), K, subject.cam_from_world, subject.frames, *poses, betas)
 
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "any h w 3"], UInt8[np.ndarray, "any h w"]]:
         """Images and masks of these views."""

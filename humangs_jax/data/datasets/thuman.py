@@ -22,7 +22,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.datasets.bodies import (
+from humangs_jax.data.datasets.subject import (
     FARTHEST,
     LARGEST_ANGLE,
     LARGEST_COEFFICIENT,

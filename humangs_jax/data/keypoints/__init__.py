@@ -1,1 +1,0 @@
-"""2D keypoints of photos, read from the files that detectors write."""

@@ -1,4 +1,18 @@
-"""Keypoints in memory: of the views of a capture, and as files have them, not yet matched to views and persons."""
+"""Keypoints in memory: of the views of a capture, and as files have them; and the sets of points that detectors are trained on.
+
+The names of points, for `side` left or right (the person's own):
+
+nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
+    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe)
+`side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
+face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
+`side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
+
+A point has the same name in every set that has it, though annotators of different sets do not mean quite the same by "hip".
+
+Sources: COCO's person_keypoints annotations; Fang-Haoshu/Halpe-FullBody; jin-s13/COCO-WholeBody's data format; OpenPose's
+"Demo - Output" page; MediaPipe's "Pose landmark detection" page.
+"""
 
 import dataclasses
 import functools
@@ -8,10 +22,151 @@ from typing import Any
 
 import numpy as np
 
+from humangs_jax.body.landmarks import Place, both_sides, place, plain_places
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json, file_numbers
 from humangs_jax.data.formats import KEYPOINTS
-from humangs_jax.data.keypoints.sets import SETS_BY_COUNT, KeypointSet
+
+SIDES = ("left", "right")
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+FINGER_JOINTS = ("1", "2", "3", "tip")
+FACE_POINTS = 68
+
+_FOOT = ("big_toe", "small_toe", "heel")
+_FEET = tuple(f"{side}_{part}" for side in SIDES for part in _FOOT)
+_PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+_COCO = ("nose", *(f"{side}_{part}" for part in _PAIRS for side in SIDES))
+_BODY_25 = (
+    *("nose", "neck"),
+    *(f"{side}_{part}" for side in ("right", "left") for part in ("shoulder", "elbow", "wrist")),
+    "mid_hip",
+    *(f"{side}_{part}" for side in ("right", "left") for part in ("hip", "knee", "ankle")),
+    *("right_eye", "left_eye", "right_ear", "left_ear"),
+    *_FEET,
+)
+_FACE_SUMS = ((0, 17, 16), (17, 27, 43), (31, 36, 66), (48, 55, 102), (55, 60, 114), (60, 65, 124), (65, 68, 132))
+"""(first, end, sum): landmarks i and sum - i are mirror images: jaw, brows, nostrils, upper and lower lip, outside and
+inside."""
+_FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
+
+
+@dataclasses.dataclass(frozen=True)
+class KeypointSet:
+    """The points of a detector: their names in its order, and for each the index of its mirror image.
+
+    A point in the middle of the body is its own mirror image. places: on the body, of points that may lie elsewhere than
+    `body.landmarks` has them: where the detector is known to see them, or a fit has found that it does. certainty: (k,) of the
+    points, the reciprocal of their noise over that of all, if a fit has found it; none: as usual.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    mirror: tuple[int, ...]
+    places: tuple[Place, ...] = ()
+    certainty: tuple[float, ...] = ()
+
+    @property
+    def offsets(self) -> Float[np.ndarray, "k 3"]:
+        """Of the places of the points, metres; 0 for points without."""
+        known = {place.name: place.offset for place in self.places}
+        return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
+
+    def adapted(self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]) -> "KeypointSet":
+        """The set as a detector is found to use it: with these offsets of the places, metres, and this certainty."""
+        own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
+        places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
+        return dataclasses.replace(self, places=places, certainty=tuple(np.asarray(certainty, float).tolist()))
+
+
+def hand_names(side: str) -> tuple[str, ...]:
+    """The 21 points of one hand, in the order of OpenPose and COCO-WholeBody."""
+    return (f"{side}_hand_root", *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS))
+
+
+def mirrored_name(name: str) -> str:
+    """The point that a mirror puts in the place of `name`."""
+    kind, _, rest = name.partition("_")
+    if kind == "face":
+        return f"face_{_mirrored_face(int(rest))}"
+    other = {"left": "right", "right": "left"}
+    return f"{other[kind]}_{rest}" if kind in other else name
+
+
+def _mirrored_face(i: int) -> int:
+    for first, end, total in _FACE_SUMS:
+        if first <= i < end:
+            return total - i
+    return (_FACE_EYES | {b: a for a, b in _FACE_EYES.items()}).get(i, i)
+
+
+def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
+    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names), places or plain_places(names))
+
+
+COCO_17 = _keypoint_set("coco17", _COCO)
+"""COCO's 17 body points."""
+
+COCO_WHOLEBODY_133 = _keypoint_set(
+    "wholebody133", (*_COCO, *_FEET, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
+)
+"""COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
+
+HALPE_26 = _keypoint_set(
+    "halpe26", (*_COCO, "head_top", "neck", "mid_hip", *(f"{side}_{part}" for part in _FOOT for side in SIDES))
+)
+"""Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet."""
+
+HALPE_136 = _keypoint_set(
+    "halpe136", (*HALPE_26.names, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right"))
+)
+"""Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
+
+OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
+"""OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
+
+# millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of hips, wrists, knees,
+# ankles and feet are the mean of these and of a barefoot man's, since synthetic people wear shoes
+_MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
+_BLAZEPOSE_PLACES = (
+    place("nose", "nose", ("head",), (0, 13, -12)),
+    *both_sides(("face_42", "face_39"), "{side}_eye", ("head",), (-15, 9, 7)),
+    *both_sides(_MIRRORED("eye"), "{side}_eye", ("head",), (-4, 9, 0)),
+    *both_sides(("face_45", "face_36"), "{side}_eye", ("head",), (6, 9, -7)),
+    *both_sides(_MIRRORED("ear"), "{side}_ear", ("head",), (-33, 1, 34)),
+    *both_sides(("face_54", "face_48"), "jaw", ("head",), (15, 37, -2)),
+    *both_sides(_MIRRORED("shoulder"), "{side}_shoulder", ("{side}_collar",), (-9, 36, -4)),
+    *both_sides(_MIRRORED("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (-1, 4, 6)),
+    *both_sides(_MIRRORED("wrist"), "{side}_wrist", ("{side}_elbow", "{side}_wrist"), (2, 9, 1)),
+    *both_sides(_MIRRORED("pinky_1"), "{side}_pinky_1", ("{side}_wrist",), (-9, -7, 24)),
+    *both_sides(_MIRRORED("index_1"), "{side}_index_1", ("{side}_wrist",), (-21, -13, -16)),
+    *both_sides(_MIRRORED("thumb_2"), "{side}_thumb_2", ("{side}_wrist",), (6, 2, -28)),
+    *both_sides(_MIRRORED("hip"), "{side}_hip", ("pelvis",), (-11, -10, 25)),
+    *both_sides(_MIRRORED("knee"), "{side}_knee", ("{side}_hip", "{side}_knee"), (0, 0, -9)),
+    *both_sides(_MIRRORED("ankle"), "{side}_ankle", ("{side}_knee", "{side}_ankle"), (2, 9, 1)),
+    *both_sides(_MIRRORED("heel"), "{side}_heel", ("{side}_ankle",), (1, -14, 17)),
+    *both_sides(_MIRRORED("foot_index"), "{side}_foot_index", ("{side}_ankle",), (-8, -4, -20)),
+)
+
+MEDIAPIPE_33 = _keypoint_set(
+    "mediapipe33",
+    (
+        *("nose", "face_42", "left_eye", "face_45", "face_39", "right_eye", "face_36", "left_ear", "right_ear"),
+        *("face_54", "face_48"),
+        *(f"{side}_{part}" for part in ("shoulder", "elbow", "wrist") for side in SIDES),
+        *(f"{side}_{part}" for part in ("pinky_1", "index_1", "thumb_2") for side in SIDES),
+        *(f"{side}_{part}" for part in ("hip", "knee", "ankle", "heel", "foot_index") for side in SIDES),
+    ),
+    _BLAZEPOSE_PLACES,
+)
+"""MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
+
+KEYPOINT_SETS = {each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_67, MEDIAPIPE_33)}
+"""The sets by name, as our npz files name them."""
+SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)}
+"""The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
+
+
+# Keypoints -------------------------------------------------------------------------------------------------------------
 
 LISTED = 5
 """Names of views in a warning, at most."""

@@ -12,8 +12,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import CaptureError, few
 from humangs_jax.data.formats import KEYPOINTS
-from humangs_jax.data.keypoints.keypoints import DetectedImage, Detections, Keypoints, Source
-from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, DetectedImage, Detections, Keypoints, Source
 from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
@@ -267,7 +266,6 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _match_paths(images: Sequence[str], names: Sequence[str]) -> dict[str, int | None]:
-    """The views of file names."""
     views = {image: _match_path(_stem(image), names) for image in images}
     videos: dict[str, list[tuple[int, str]]] = {}
     for image in views:
@@ -289,13 +287,11 @@ def _match_paths(images: Sequence[str], names: Sequence[str]) -> dict[str, int |
 
 
 def _stem(image: str) -> PurePosixPath:
-    """The path of an image without the suffix of a photo."""
     path = PurePosixPath(image.replace("\\", "/"))
     return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
 
 
 def _split_number(name: str) -> tuple[str, int | None]:
-    """A name without the number at its end, and that number."""
     prefix = name.rstrip("0123456789")
     return prefix, int(name[len(prefix) :]) if len(prefix) < len(name) else None
 
@@ -334,7 +330,6 @@ def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, in
 
 
 def _plain(name: str) -> str:
-    """The name without zeros before numbers."""
     return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 

@@ -2,39 +2,230 @@
 
 A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written synthetic sets, data sets),
 `GeneratedSource` (people made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one:
-each process the rows of its devices, some batches ahead.
+each process the rows of its devices, some batches ahead of the loop. Several threads make examples in order, one prepares the
+batches that are asked for next. Threads suffice: decoding and jitted functions release the interpreter's lock.
 """
 
-from humangs_jax.data.loading.batches import Loader, Waiting
-from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, PeopleCache, find_captures
-from humangs_jax.data.loading.examples import (
-    Example,
-    Mixture,
-    Source,
-    StoredSubject,
-    ViewSampling,
-    draw_views,
-    nearest_view,
-    shrink,
-    subject_order,
-    subject_views,
-)
+import collections
+import concurrent.futures
+import dataclasses
+import queue
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from typing import TypeVar
 
-__all__ = [
-    "CaptureCache",
-    "CaptureSource",
-    "Example",
-    "Loader",
-    "Mixture",
-    "PeopleCache",
-    "Source",
-    "StoredSubject",
-    "ViewSampling",
-    "Waiting",
-    "draw_views",
-    "find_captures",
-    "nearest_view",
-    "shrink",
-    "subject_order",
-    "subject_views",
-]
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Array
+from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, PeopleCache
+from humangs_jax.data.loading.examples import Example, Mixture, Source, ViewSampling, input_count_at
+
+__all__ = ["CaptureCache", "CaptureSource", "Example", "Loader", "Mixture", "PeopleCache", "Source", "ViewSampling"]
+
+T = TypeVar("T")
+
+THREAD_NAME = "humangs-loader"
+AHEAD = 2
+"""Batches prepared while one is worked on."""
+
+
+@dataclasses.dataclass
+class Waiting:
+    """How long a loop waited for its data: total seconds, of `items` items, of which the first took `first_seconds`."""
+
+    seconds: float = 0.0
+    first_seconds: float = 0.0
+    items: int = 0
+
+    def add(self, seconds: float) -> None:
+        """One more item."""
+        if self.items == 0:
+            self.first_seconds = seconds
+        self.seconds += seconds
+        self.items += 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Loader:
+    """Batches from a source.
+
+    batch_size: subjects of the global batch, over all processes. seed: of order and views.
+    sharding: how a batch lies on the devices (only its first axis may be split); a process makes the rows that its own
+        devices hold, so that replicas hold equal rows. None: everything on the default device.
+    first_step, first_example: where the numbering of examples starts: those of steps before had other batches.
+    process_index, process_count: where `sharding` is None, the part of the batch to make: equal runs of rows.
+    threads: that make examples.
+
+    Raises: ValueError if the batch cannot be divided among the processes.
+    """
+
+    source: Source
+    batch_size: int = 1
+    seed: int = 0
+    sharding: jax.sharding.Sharding | None = None
+    first_step: int = 0
+    first_example: int = 0
+    process_index: int = 0
+    process_count: int = 1
+    threads: int = 4
+
+    def __post_init__(self):
+        if self.batch_size % self.process_count or not 0 <= self.process_index < self.process_count:
+            raise ValueError(
+                f"a batch of {self.batch_size} cannot be divided among {self.process_count} processes "
+                f"(this is {self.process_index})"
+            )
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Rows of the global batch that this process makes."""
+        if self.sharding is None:
+            share = self.batch_size // self.process_count
+            return tuple(range(self.process_index * share, (self.process_index + 1) * share))
+        parts = self.sharding.addressable_devices_indices_map((self.batch_size,)).values()
+        return tuple(sorted({row for part in parts if part is not None for row in range(self.batch_size)[part[0]]}))
+
+    def input_count(self, step: int) -> int:
+        """Number of input views of a step."""
+        return input_count_at(self.seed, step, self.source.input_counts)
+
+    def example_at(self, step: int, row: int) -> Example:
+        """Row `row` of the global batch of a step."""
+        return self.source.example(self.seed, self._number(step, row), self.input_count(step))
+
+    def describe_at(self, step: int, row: int) -> str:
+        """Whom that row shows, in words."""
+        return self.source.describe(self.seed, self._number(step, row), self.input_count(step))
+
+    def _number(self, step: int, row: int) -> int:
+        return self.first_example + (step - self.first_step) * self.batch_size + row
+
+    def batch_at(self, step: int) -> Example:
+        """The batch of a step on the devices: an `Example` with a leading batch axis on every leaf.
+
+        With a sharding, global arrays; without one, the rows of this process.
+        """
+        return self._place([self.example_at(step, row) for row in self.rows])
+
+    def batches(self, start: int, stop: int, waiting: Waiting | None = None) -> Generator[tuple[int, Example], None, None]:
+        """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
+
+        Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
+        waiting: the time that the loop waited for batches is added to it.
+        """
+
+        def make():
+            rows = self.rows
+            examples = read_in_order(
+                lambda i: self.example_at(start + i // len(rows), rows[i % len(rows)]),
+                (stop - start) * len(rows),
+                self.threads,
+                AHEAD * len(rows),
+            )
+            try:
+                for step in range(start, stop):
+                    yield step, self._place([next(examples) for _ in rows])
+            finally:
+                examples.close()
+
+        return prefetched(make, AHEAD, waiting)
+
+    def _place(self, examples: list[Example]) -> Example:
+        """Stack the rows of this process and put them on the devices."""
+        batch = jax.tree.map(_stack, *examples)
+        sharding = self.sharding
+        if sharding is None:
+            return jax.tree.map(jnp.asarray, batch)
+        position = {row: i for i, row in enumerate(self.rows)}
+
+        def place(leaf):
+            def shard(index):
+                chosen = [position[row] for row in range(self.batch_size)[index[0]]]
+                return leaf[chosen[0] : chosen[-1] + 1][(slice(None), *index[1:])]
+
+            return jax.make_array_from_callback((self.batch_size, *leaf.shape[1:]), sharding, shard)
+
+        return jax.tree.map(place, batch)
+
+
+def _stack(*leaves: Array | np.ndarray) -> Array | np.ndarray:
+    """Leaves that are all on a device stay there."""
+    on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
+    return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
+
+
+# Threads --------------------------------------------------------------------------------------------------------------
+
+
+def prefetched(make: Callable[[], Iterator[T]], ahead: int, waiting: Waiting | None = None) -> Generator[T, None, None]:
+    """The items of the iterator that `make()` returns, up to `ahead` of them prepared by a thread.
+
+    The iterator is used and closed in the thread. Its errors are raised here. Closing the generator (or leaving the
+    loop over it) ends the thread. waiting: the time that the loop waited is added to it.
+    """
+    ready: queue.Queue = queue.Queue(maxsize=max(1, ahead))
+    stopped = threading.Event()
+
+    def put(item):
+        while not stopped.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+                return
+            except queue.Full:
+                continue
+
+    def produce():
+        iterator = None
+        try:
+            iterator = make()
+            for item in iterator:
+                if stopped.is_set():
+                    return
+                put((item, None, False))
+            put((None, None, True))
+        except BaseException as error:  # the error is raised in the loop
+            put((None, error, True))
+        finally:
+            close = getattr(iterator, "close", None)
+            if close is not None:
+                close()
+
+    thread = threading.Thread(target=produce, name=THREAD_NAME, daemon=True)
+    thread.start()
+    try:
+        while True:
+            began = time.perf_counter()
+            item, error, last = ready.get()
+            if error is not None:
+                raise error
+            if last:
+                return
+            if waiting is not None:
+                waiting.add(time.perf_counter() - began)
+            yield item
+    finally:
+        stopped.set()
+        thread.join()
+
+
+def read_in_order(make: Callable[[int], T], count: int, threads: int, ahead: int) -> Generator[T, None, None]:
+    """make(0), make(1), ..., make(count - 1), up to `ahead` of them started before they are needed.
+
+    Raises: what `make` raises, in its turn.
+    """
+    threads, ahead = max(1, threads), max(1, ahead, threads)
+    with concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="humangs-reader") as pool:
+        pending = collections.deque(pool.submit(make, i) for i in range(min(ahead, count)))
+        begun = len(pending)
+        try:
+            while pending:
+                yield pending.popleft().result()
+                if begun < count:
+                    pending.append(pool.submit(make, begun))
+                    begun += 1
+        finally:
+            for future in pending:
+                future.cancel()

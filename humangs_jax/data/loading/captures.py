@@ -78,20 +78,9 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     frames, K, cam_from_world = read_frames_and_matrices(views, len(rotations), file)
     for i in range(len(views)):
         checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
-    centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
-    offsets = centers - centers.mean(axis=0)
-    return StoredSubject(
-        images=np.zeros((0, height, width, 3), np.uint8),
-        masks=np.zeros((0, height, width), np.uint8),
-        K=K,
-        cam_from_world=cam_from_world,
-        frames=frames,
-        azimuths=np.arctan2(offsets[:, 0], offsets[:, 2]),
-        rotations=rotations,
-        translations=translations,
-        # coefficients that a capture leaves out are 0: one length for all, so that subjects stack
-        betas=np.pad(betas, (0, body.shape_directions.shape[-1] - len(betas))),
-    )
+    # coefficients that a capture leaves out are 0: one length for all, so that subjects stack
+    betas = np.pad(betas, (0, body.shape_directions.shape[-1] - len(betas)))
+    return StoredSubject.without_photos((height, width), K, cam_from_world, frames, rotations, translations, betas)
 
 
 def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
@@ -102,7 +91,6 @@ def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
 
 
 def _check_image(file: Path) -> tuple[tuple[int, int], bool]:
-    """((width, height), whether there is an alpha channel)."""
     return read_checked(check_image, file)
 
 
@@ -295,7 +283,6 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def _found(self, seed: int, index: int, input_count: int) -> tuple[Path | str, Example]:
-        """The folder and the example."""
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
         for subject_index in np.roll(order, -position).tolist():

@@ -57,6 +57,18 @@ class StoredSubject(NamedTuple):
     translations: Float[np.ndarray, "m 3"]
     betas: Float[np.ndarray, " s"]
 
+    @classmethod
+    def without_photos(
+        cls, size: tuple[int, int], K: np.ndarray, cam_from_world: np.ndarray, frames: np.ndarray, *body: np.ndarray
+    ) -> "StoredSubject":
+        """A subject of no photos yet, of that height and width. body: rotations, translations, betas."""
+        centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
+        offsets = centers - centers.mean(axis=0)
+        images, masks = np.zeros((0, *size, 3), np.uint8), np.zeros((0, *size), np.uint8)
+        azimuths = np.arctan2(offsets[:, 0], offsets[:, 2])
+        arrays = (np.asarray(x, np.float32) for x in (K, cam_from_world))
+        return cls(images, masks, *arrays, frames, azimuths, *(np.asarray(x, np.float32) for x in body))
+
 
 @pytree_dataclass
 class Example:

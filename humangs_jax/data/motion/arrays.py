@@ -5,6 +5,7 @@ Rotations are axis-angles or matrices (three times as many numbers). What a file
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
-from humangs_jax.data.motion import skeleton
-from humangs_jax.data.motion.mhr import clip_of_points
-from humangs_jax.data.motion.motion import MotionError, Poses, Reading
+from humangs_jax.data.motion import MotionError, Poses, Reading, skeleton
 from humangs_jax.data.motion.people import SHOWN, Person, expected, format_of, read_people
 from humangs_jax.data.motion.rules import (
     COLUMNS,
@@ -26,6 +25,8 @@ from humangs_jax.data.motion.rules import (
     PELVIS,
     joint_places,
 )
+from humangs_jax.data.motion.skeleton import Clip
+from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.restricted_pickle import as_array
 from humangs_jax.io.tensors import read_values
@@ -77,7 +78,6 @@ def _frames(person: Person) -> int:
 
 
 def _whole(file: "_MotionFile", form: ArrayKeys) -> Rotations:
-    """Of our own format, of any number of joints."""
     (key,) = form.poses.values()
     if not file.flat_hand_mean:
         raise MotionError(file.path, key, "our own format holds whole rotations: expected flat_hand_mean=True")
@@ -85,7 +85,6 @@ def _whole(file: "_MotionFile", form: ArrayKeys) -> Rotations:
 
 
 def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
-    """(m, 55, 3) of all places."""
     rotations: Rotations | None = None
     count = None
     for place, key in form.poses.items():
@@ -105,7 +104,6 @@ def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
 
 
 def _part(file: "_MotionFile", form: ArrayKeys, place: str, key: str, count: int | None) -> Rotations:
-    """(m, n, 3) of the joints of a place."""
     values = file.numbers(key, None)
     most = PLACES[place][1]
     if count is None:
@@ -168,7 +166,6 @@ def _orthonormal(matrices: Float[np.ndarray, "*n 3 3"]) -> bool:
 
 
 def _axis_angles(file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int) -> Rotations:
-    """(m, joints, 3) from as many axis-angles or matrices."""
     if flat.shape[1] == 3 * joints:
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
@@ -265,3 +262,58 @@ class _MotionFile(ArrayFile):
         if not form.fixed:
             self.said.append(NO_RATE.format(form.fps))
         return form.fps
+
+
+# Points in space: SAM 3D Body ------------------------------------------------------------------------------------------
+
+RIG = {
+    1: ("pelvis", -1), 2: ("left_hip", 1), 3: ("left_knee", 2), 4: ("left_ankle", 3), 8: ("left_foot", 4),
+    18: ("right_hip", 1), 19: ("right_knee", 18), 20: ("right_ankle", 19), 24: ("right_foot", 20),
+    34: ("spine0", 1), 35: ("spine1", 34), 36: ("spine2", 35), 37: ("spine3", 36), 110: ("neck", 37), 113: ("head", 110),
+    74: ("left_collar", 37), 75: ("left_shoulder", 74), 76: ("left_elbow", 75), 78: ("left_wrist", 76),
+    38: ("right_collar", 37), 39: ("right_shoulder", 38), 40: ("right_elbow", 39), 42: ("right_wrist", 40),
+}  # fmt: skip
+"""Of the rig's 127: name and the joint above."""
+RIG_JOINTS = 127
+RIG_Y_UP = np.array([1.0, -1.0, -1.0])
+
+
+def clip_of_points(file: Any, fps: float) -> Clip:
+    """The skeleton in motion of an `ArrayFile`. Raises: the file's error, naming the key."""
+    points = _of_frames(file, "pred_joint_coords", (RIG_JOINTS, 3))[:, list(RIG)]
+    if "pred_cam_t" in file.values:
+        points = points + _of_frames(file, "pred_cam_t", (3,), len(points))[:, None]
+    else:
+        file.said.append("the file has no pred_cam_t: people stay in place")
+    index = {joint: i for i, joint in enumerate(RIG)}
+    parents = tuple(index.get(parent, -1) for _, parent in RIG.values())
+    places = points * RIG_Y_UP
+    if "pred_global_rots" in file.values:
+        turns = _of_frames(file, "pred_global_rots", (RIG_JOINTS, 3, 3), len(points))[:, list(RIG)]
+    else:
+        turns = _carried(places, parents)
+    rest = np.zeros(places.shape[1:])
+    for i, p in enumerate(parents):
+        if p >= 0:
+            rest[i] = rest[p] + np.einsum("mba,mb->ma", turns[:, p], places[:, i] - places[:, p]).mean(axis=0)
+    names = tuple(name for name, _ in RIG.values())
+    return Clip(names, parents, rest, turns, places, fps, "y", "; ".join(file.said))
+
+
+def _of_frames(file: Any, key: str, shape: tuple[int, ...], count: int | None = None) -> Float[np.ndarray, "m ..."]:
+    values = file.numbers(key, None)
+    values = values.reshape(1, *shape) if values.size == np.prod(shape) else values
+    if values.shape[1:] != shape and values.shape[2:] == shape and values.shape[1] == 1:
+        values = values[:, 0]
+    return values if values.shape == (count or len(values), *shape) else file.numbers(key, (count, *shape))
+
+
+def _carried(places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]) -> Float[np.ndarray, "m s 3 3"]:
+    """Rotations of bones from the first frame on, where a file has none: the smallest turns down the tree."""
+    turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))
+    for i, p in enumerate(parents):
+        if p >= 0:
+            first = unit(places[0, i] - places[0, p])
+            turns[:, p] = smallest_turns(turns[:, p] @ first, unit(places[:, i] - places[:, p])) @ turns[:, p]
+            turns[:, i] = turns[:, p]
+    return turns

@@ -110,7 +110,6 @@ def _lengths(parents: Sequence[int], rest: Places) -> np.ndarray:
 
 
 def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]:
-    """The longest way down from a joint, itself first."""
     path = [joint]
     while children[path[-1]]:
         path.append(max(children[path[-1]], key=lambda child: reach[child]))
@@ -162,7 +161,6 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
 def _sided(
     plain: Sequence[str], parents: Sequence[int], posed: Places, pelvis: int, legs: Pair, chest: int, arms: Pair
 ) -> dict[str, int]:
-    """Names of the joints of both pairs of limbs."""
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
     forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])

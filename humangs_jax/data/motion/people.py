@@ -62,7 +62,6 @@ def read_people(path: Path, error: type[FileError]) -> list[Person]:
 
 
 def _of_file(file: Path, people: list[Person]) -> list[Person]:
-    """The people of one file of several: a single one has the number of the file."""
     return [each._replace(name=(_numbers(file) or [file.stem])[-1]) for each in people] if len(people) == 1 else people
 
 
@@ -95,7 +94,6 @@ def _numbers(file: Path) -> list[str]:
 
 
 def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
-    """The people in what a file holds."""
     frames = _listed_frames(content)
     if frames is not None:
         return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
@@ -153,7 +151,6 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
 
 
 def _turns(value: Any) -> bool:
-    """Whether (n, 3, 3) are rotation matrices."""
     array = np.asarray(as_array(value))
     if array.shape[1:] != (3, 3) or array.dtype.kind not in "fiu":
         return False

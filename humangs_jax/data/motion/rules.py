@@ -233,7 +233,6 @@ def _opposite(a: str, b: str) -> bool:
 
 
 def _on_hands(points: Float[np.ndarray, "pairs s 3"], up: str) -> bool:
-    """Whether the lowest joint is one of the arms most of the time."""
     return float(np.isin((points[::2] @ upright_matrix(up)[1]).argmin(axis=1), HANDS).mean()) > 0.5
 
 

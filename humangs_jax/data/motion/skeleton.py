@@ -218,7 +218,6 @@ def _pelvis_turns(
 
 
 def _pelvis_frame(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "3 3"]:
-    """From our rest frame to the file's, by the line of the hips and the direction of the spine."""
     theirs = clip.rest[source["left_hip"]] - clip.rest[source["right_hip"]]
     top = joints[_INDEX[_top(source)]] - joints[0]
     ours = _frame(joints[_INDEX["left_hip"]] - joints[_INDEX["right_hip"]], top)
@@ -284,7 +283,6 @@ def _steps(heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, f
 def _steps_of_body(
     world: Sequence[Float[np.ndarray, "m 3 3"]], joints: Float[np.ndarray, "j 3"], moves: Float[np.ndarray, "m 3"], source: Source
 ) -> Float[np.ndarray, " m"]:
-    """(m,) the same of our body, above a floor at the height of its lowest joint in T-pose."""
     places = {0: moves}
 
     def place(j):

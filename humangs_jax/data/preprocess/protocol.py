@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int, UInt8
+from humangs_jax.data.calibration.calibration import pose_matrix
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_crosses
@@ -57,13 +58,6 @@ def box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64)
 
 
-def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """[[R, t], [0, 0, 0, 1]]."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
-
-
 def moved(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Points through a rigid transform."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
@@ -74,7 +68,7 @@ def scan_alignment(
 ) -> Float[np.ndarray, "4 4"]:
     """`mesh_transform` of a scan, R @ T: first the middle of its bounding box to the origin, then upright."""
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return rigid(R, -R @ box_middle(scan))
+    return pose_matrix(R, -R @ box_middle(scan))
 
 
 def video_alignment(
@@ -82,7 +76,7 @@ def video_alignment(
 ) -> Float[np.ndarray, "4 4"]:
     """`mesh_transform` of a video, T @ R: upright first, then the middle of the turned body of frame 0 to the origin."""
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return rigid(R, -box_middle(body @ R.T))
+    return pose_matrix(R, -box_middle(body @ R.T))
 
 
 def bounding_radius(points: Float[np.ndarray, "n 3"]) -> float:
@@ -123,18 +117,18 @@ def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple
     return order[:train], order[train : train + test]
 
 
-def evaluation_indices(counts: Mapping[str, int], inputs: int, targets: int = TARGETS) -> dict[str, dict[str, list[int]]]:
+def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict[str, list[int]]]:
     """{scene: {"context": [...], "target": [...]}} of scenes in file order with their numbers of views.
 
-    Python's generator of seed 777: `inputs` views, then `targets` of the others. Raises: ValueError for a scene of too few.
+    Python's generator of seed 777: `inputs` views, then `TARGETS` of the others. Raises: ValueError for a scene of too few.
     """
     generator, found = random.Random(EVALUATION_SEED), {}
     for name, count in counts.items():
-        if count < inputs + targets:
-            raise ValueError(f"{name}: {count} views, but {inputs} inputs and {targets} targets are asked for")
+        if count < inputs + TARGETS:
+            raise ValueError(f"{name}: {count} views, but {inputs} inputs and {TARGETS} targets are asked for")
         context = sorted(generator.sample(range(count), inputs))
         rest = [view for view in range(count) if view not in set(context)]
-        found[name] = {"context": context, "target": sorted(generator.sample(rest, targets))}
+        found[name] = {"context": context, "target": sorted(generator.sample(rest, TARGETS))}
     return found
 
 

@@ -17,7 +17,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,9 @@ from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY, parameter_arrays
-from humangs_jax.data.capture_checks import CaptureError, checked_json, required
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, posed_people, turned
+from humangs_jax.data.capture_checks import CaptureError, checked_json, expect, members
 from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays, write_list
-from humangs_jax.data.datasets.subject import Subject
+from humangs_jax.data.datasets.subject import BodyParameters, FileBody, PosedPerson, Subject, posed_people, turned
 from humangs_jax.data.datasets.thuman import (
     FIT_MESH,
     ThumanSet,
@@ -71,7 +70,6 @@ from humangs_jax.io.reading import write_json
 SKIPPED = "skipped"
 SCENE, CAPTURE = "scene.json", "capture.json"
 Layout = Literal["scenes", "capture"]
-T = TypeVar("T")
 Photo = tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]
 """An image on white and its mask."""
 
@@ -166,7 +164,7 @@ def preprocess(
                 done += 1
                 (out / SKIPPED / f"{name}.json").unlink(missing_ok=True)
             else:
-                _skip(out, name, str(error))
+                _skip(out, name, str(error) or type(error).__name__)
     finally:
         manifest = _finish(out, [*names, *absent], settings)
     counts = manifest["counts"]
@@ -177,7 +175,6 @@ def preprocess(
 
 
 def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[str, str]]:
-    """Where the subjects are by name, and why some lack a file."""
     data_set = DATASETS[settings.kind]
     if data_set.scans:
         found = open_thuman(source)
@@ -246,30 +243,21 @@ def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, An
 def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
     """What a finished folder says of itself. Raises: CaptureError naming file and key."""
     content = checked_json(file)
-    known = _of_kind(content, "known", dict, file)
-    _of_kind(known, "views", int, file, "known.")
-    for reason in _of_kind(known, "missing", dict, file, "known.") if "missing" in known else ():
-        _of_kind(known["missing"], reason, int, file, "known.missing.")
-    if "unreadable" in known:
-        _of_kind(known, "unreadable", dict, file, "known.")
+    (known,) = members(content, file, known=dict)
+    members(known, file, "known", views=int)
+    for key in {"missing", "unreadable"} & known.keys():
+        expect(known[key], dict, file, f"known.{key}")
+    for reason, count in known.get("missing", {}).items():
+        expect(count, int, file, f"known.missing.{reason}")
     if settings.layout == "scenes":
-        _of_kind(_of_kind(content, "entry", dict, file), "frames", list, file, "entry.")
+        (entry,) = members(content, file, entry=dict)
+        members(entry, file, "entry", frames=list)
     return content
-
-
-def _of_kind(mapping: Any, key: str, kind: type[T], file: Path, prefix: str = "") -> T:
-    value = required(mapping, key, file, prefix) if isinstance(mapping, dict) else None
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise CaptureError(file, prefix + key, f"expected {_KINDS[kind]}, got {type(value).__name__}")
-    return value
-
-
-_KINDS: dict[type, str] = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
 
 
 def _write_lists(out: Path, names: Sequence[str], scenes: dict[str, dict[str, Any]], settings: Settings) -> dict[str, Any]:
     skipped = {
-        file.stem: _of_kind(checked_json(file), "reason", str, file)
+        file.stem: members(checked_json(file), file, reason=str)[0]
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }
@@ -365,7 +353,6 @@ def write_video(folder: Path, name: str, subject: Subject, body: FileBody, setti
 
 
 def _photos(subject: Subject, views: Int[np.ndarray, " n"], size: int) -> list[Photo | Exception]:
-    """Photos or, in their place, what is wrong with one."""
     import concurrent.futures
 
     def photo(view):
@@ -401,7 +388,6 @@ def _write(folder: Path, name: str, content: Content, body: FileBody, settings: 
 
 
 def _write_images(folder: Path, view: View) -> tuple[str, ...]:
-    """Their paths relative to the folder."""
     paths = tuple(f"{kind}/{view.name}.png" for kind in ("images", "masks"))
     for path, pixels in zip(paths, (view.image, view.mask), strict=True):
         (folder / path).parent.mkdir(parents=True, exist_ok=True)

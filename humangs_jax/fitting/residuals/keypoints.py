@@ -12,8 +12,7 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
-from humangs_jax.fitting.solve import robust
-from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of
+from humangs_jax.fitting.state import FitState, Origin, PosePrior, betas_of, limit_residuals, pose_of, robust
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.transform import EXACT

@@ -21,8 +21,6 @@ from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.fitting.scan_files import Scan
-from humangs_jax.fitting.similarity import Similarity
-from humangs_jax.fitting.solve import robust
 from humangs_jax.fitting.state import (
     FitState,
     Origin,
@@ -31,9 +29,11 @@ from humangs_jax.fitting.state import (
     limit_residuals,
     pose_of,
     pose_prior,
+    robust,
     scale_of,
     usual_origin,
 )
+from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
@@ -270,7 +270,6 @@ class Target:
         return away[weights > 0], float((weights > 0).mean())
 
     def _posed(self, problem: ScanProblem, state: FitState) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Vertices (n, 3) in units of the frame and normals (n, 3)."""
         vertices, normals = pose_surface(problem.surface, *problem.body(state))
         return np.asarray(vertices, np.float64) / float(scale_of(state)), np.asarray(normals, np.float64)
 

@@ -21,7 +21,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel, SurfacePoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.fitting.solve import robust
+from humangs_jax.fitting.state import robust
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.maps import sample_bilinear

@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import PARENTS
-from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.subject import FileBody
 
 VERTICES, COLUMNS, FRAMES, CAMERAS = 80, 10, 3, 2
 WIDTH, HEIGHT = 12, 16

@@ -1,54 +1,30 @@
-"""Some thirty kinds of damage to every layout: one error line that names the file and, where there is one, the key.
+"""Every kind of damage to every layout: one error line that names the file and, where there is one, the key.
 
-No code of a file runs, nothing becomes large, nothing takes long. `EVERY` is done to files of all layouts.
+What can be done to any file (cut, other bytes, code in it, size) is done to these ones by `tests/hostile`.
 """
 
 import functools
 import json
 import pickle
 import shutil
-import time
-import tracemalloc
 
 import dataset_files as files
 import numpy as np
 import pytest
-from changes import edit_pickle
-from damages import (
-    a_folder,
-    bomb,
-    bytes_of,
-    evil_pickle,
-    jsn,
-    npz,
-    object_npz,
-    pkl,
-    removed,
-    scale_obj,
-    spoiled,
-    swap_npz,
-    text,
-)
+from changes import edit_bytes, edit_json, edit_npz, edit_pickle, edit_text
+from PIL import Image
 
-from humangs_jax.data.datasets.bodies import BodyParameters, posed_people
 from humangs_jax.data.datasets.subject import open_people
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.preprocess.run import Settings, preprocess, scan_content
 from humangs_jax.io.reading import FileError
 
-MOST_BYTES, MOST_SECONDS = 300 << 20, 10.0
-"""What a damaged file may cost; the limit plain_bytes is 256 MiB."""
-LARGE = ("bomb", "memory", "10^", "65,536")
-"""In names of cases whose memory is measured."""
 SIZE = 16
 
 
 @pytest.fixture(scope="module")
 def body(tmp_path_factory):
-    body = files.write_model(tmp_path_factory.mktemp("body"))
-    rest = BodyParameters(np.zeros(20), np.zeros((1, 55, 3)), np.zeros((1, 3)))
-    next(posed_people(body.model, rest))  # compiled before anything is timed
-    return body
+    return files.write_model(tmp_path_factory.mktemp("body"))
 
 
 def read_thuman(folder, body):
@@ -89,27 +65,47 @@ def case(layout, name, damage, *words):
 thuman, scenes, dna, actorshq = (functools.partial(case, layout) for layout in ("thuman", "scenes", "dna", "actorshq"))
 
 
-def every(layout, path, kind, whole=False, cut=2):
-    """What can be done to any file. kind: in the error of bytes that are none of the format.
-
-    whole: a folder in its place is as good as no file: what that does is said elsewhere. cut: the part of the file that is left.
-    """
-    name = path.rsplit("/", 1)[-1]
-    case(layout, f"{name} empty", bytes_of(path, lambda data: b""), name)
-    case(layout, f"{name} cut off", bytes_of(path, lambda data: data[: len(data) // cut]), name)
-    case(layout, f"{name} of other bytes", bytes_of(path, lambda data: bytes(range(256)) * 8), name, kind)
-    if not whole:
-        case(layout, f"{name} a folder", a_folder(path), name, "folder")
+def damage_by(change):
+    """A maker of damages: change(path, ...) is done to a path of the data set's folder."""
+    return lambda path, *values, **changes: lambda folder: change(folder / path, *values, **changes)
 
 
-def of_images(layout, photo, mask, small=(5, 5)):
-    from PIL import Image
+bytes_of, jsn, npz, pkl, text = map(damage_by, (edit_bytes, edit_json, edit_npz, edit_pickle, edit_text))
+written, removed = damage_by(lambda path, content: path.write_text(content)), damage_by(lambda path: path.unlink())
+resized = damage_by(lambda path: Image.new("L", (5, 5)).save(path, "PNG"))
 
-    every(layout, photo, "image")
-    every(layout, mask, "image")
-    resize = lambda path: lambda folder: Image.new("L", small).save(folder / path, "PNG")
-    case(layout, "a photo of another size", resize(photo), "size", "5 x 5")
-    case(layout, "a mask of another size", resize(mask), "size", "5 x 5")
+
+def spoiled(value, at=0):
+    def change(array):
+        array = array.copy()
+        array.reshape(-1)[at] = value
+        return array
+
+    return change
+
+
+@damage_by
+def scaled_obj(path, factor):
+    lines = [line.split() for line in path.read_text().splitlines()]
+    scaled = [[w[0], *(str(factor * float(x)) for x in w[1:])] if w[0] == "v" else w for w in lines]
+    path.write_text("\n".join(" ".join(words) for words in scaled))
+
+
+@damage_by
+def swapped_npz(path, one, other):
+    values = dict(np.load(path))
+    np.savez(path, **(values | {one: values[other], other: values[one]}))
+
+
+@damage_by
+def swapped_pkl(path, one, other):
+    content = pickle.loads(path.read_bytes())
+    edit_pickle(path, **{one: content[other], other: content[one]})
+
+
+def of_images(layout, photo, mask):
+    case(layout, "a photo of another size", resized(photo), "size", "5 x 5")
+    case(layout, "a mask of another size", resized(mask), "size", "5 x 5")
     huge = lambda data: b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\1\0\0\0\1\0\0\x08\2\0\0\0" + bytes(40)
     case(layout, "a photo of 65,536 pixels a side", bytes_of(photo, huge), photo.rsplit("/", 1)[-1])
 
@@ -119,7 +115,6 @@ def of_images(layout, photo, mask, small=(5, 5)):
 for layout in ("avatarrex", "thuman4", "actorshq"):
     this = functools.partial(case, layout)
     file = "smpl_params.npz"
-    every(layout, file, "npz archive")
     this("poses missing", removed(file), file, "no such file")
     for key in ("global_orient", "body_pose", "transl", "left_hand_pose", "betas"):
         this(f"{key} missing", npz(file, **{key: None}), file, key, "missing")
@@ -133,17 +128,16 @@ for layout in ("avatarrex", "thuman4", "actorshq"):
     this("no frames", npz(file, global_orient=lambda x: x[:0]), file, "global_orient", "(0, 3)")
     this("text", npz(file, transl=lambda x: x.astype(str)), file, "transl", "real numbers")
     this("complex numbers", npz(file, transl=lambda x: x + 0j), file, "transl", "real numbers")
-    this("300 shape coefficients", npz(file, betas=lambda x: np.ones((3, 300))), file, "betas", "10 such directions")
+    this(
+        "300 shape coefficients", npz(file, betas=lambda x: np.ones((3, 300))), file, "betas", "'shape_10' is no shape direction"
+    )
     this("shape of other frames", npz(file, betas=lambda x: x[:2]), file, "betas", "(2, 10)")
     this("shape of 1,000", npz(file, betas=lambda x: x + 1000), file, "betas", "another unit?")
-    this("an object that runs code", object_npz(file, "transl"), file, "transl", "pickled")
-    this("a bomb", bomb(file), file, "limit")
 
 # Calibrations -----------------------------------------------------------------------------------------------------------
 
 for layout, file, camera in (("avatarrex", "calibration_full.json", "22010708"), ("thuman4", "calibration.json", "cam00")):
     this = functools.partial(case, layout)
-    every(layout, file, "", whole=True)
     this("calibration missing", removed(file))
     set_to = lambda key, change, camera=camera, file=file: jsn(file, lambda c: c[camera].update({key: change(c[camera][key])}))
     for key in ("K", "R", "T"):
@@ -162,8 +156,8 @@ for layout, file, camera in (("avatarrex", "calibration_full.json", "22010708"),
     this("an image size of 10^9", set_to("imgSize", lambda x: [10**9, 16]), file, camera, "imgSize")
     this("the sizes exchanged", set_to("imgSize", lambda x: x[::-1]), camera, "16 x 12")
     this("a camera that leads out", jsn(file, lambda c, n=camera: c.update({"../../x": c.pop(n)})), file, "../../x")
-    this("a list", lambda folder, file=file: (folder / file).write_text("[1, 2]"), file)
-    this("nested 10,000 times", lambda folder, file=file: (folder / file).write_text('{"a":' * 10000), file)
+    this("a list", written(file, "[1, 2]"), file)
+    this("nested 10,000 times", written(file, '{"a":' * 10000), file)
 of_images("avatarrex", "22010708/00000001.jpg", "22010708/mask/pha/00000001.jpg")
 of_images("thuman4", "images/cam00/00000001.jpg", "masks/cam00/00000001.jpg")
 case(
@@ -175,7 +169,6 @@ case(
 )
 
 CSV = "4x/calibration.csv"
-every("actorshq", CSV, "UTF-8", whole=True, cut=3)
 of_images("actorshq", "4x/rgbs/Cam001/Cam001_rgb000001.jpg", "4x/masks/Cam001/Cam001_mask000001.png")
 actorshq("calibration missing", removed(CSV))
 actorshq("a column missing", text(CSV, "name,w,h,rx", "name,w,h,ax"), CSV, "Cam001.rx")
@@ -192,13 +185,6 @@ actorshq("a name that leads out", text(CSV, "Cam001", "../../x"), CSV, "name")
 
 PKL, OBJ = "smplx_param.pkl", "mesh_smplx.obj"
 FIT, MESH, SCAN = "smplx/0001/smplx_param.pkl", "smplx/0001/mesh_smplx.obj", "model/0001/0001.obj"
-every("thuman", FIT, "pickle", whole=True)
-thuman("a pickle that runs code", evil_pickle(FIT), PKL, "refused")
-thuman(
-    "a pickle that fills the memory",
-    lambda f: (f / FIT).write_bytes(b"\x80\x04]" + b"2" * 0 + b"(" + b"\x8e" + (1 << 60).to_bytes(8, "little")),
-    PKL,
-)
 thuman("a pickle of a list", lambda f: (f / FIT).write_bytes(pickle.dumps([1])), PKL, "dict")
 for key in ("scale", "global_orient", "body_pose", "left_hand_pose", "betas", "expression"):
     case("thuman", f"{key} missing", pkl(FIT, **{key: None}), PKL, key, "missing")
@@ -218,17 +204,14 @@ thuman(
 thuman("no leading axis", pkl(FIT, body_pose=lambda x: x[0]), PKL, "body_pose", "(63,)")
 thuman("degrees", pkl(FIT, global_orient=lambda x: np.rad2deg(x) + 90), "global_orient", "another unit?")
 thuman("millimetres", pkl(FIT, transl=lambda x: 1000 * x + 500), "transl", "another unit?")
-thuman("jaw and left eye exchanged with the root", lambda f: pkl_swap(f, "jaw_pose", "global_orient"), OBJ, "mm from this mesh")
-thuman("left and right hands exchanged", lambda f: pkl_swap(f, "left_hand_pose", "right_hand_pose"), OBJ, "mm from this mesh")
-every("thuman", MESH, "")
+thuman("jaw and left eye exchanged with the root", swapped_pkl(FIT, "jaw_pose", "global_orient"), OBJ, "mm from this mesh")
+thuman("left and right hands exchanged", swapped_pkl(FIT, "left_hand_pose", "right_hand_pose"), OBJ, "mm from this mesh")
 thuman("no fitted mesh", removed(MESH), OBJ, "no such file")
 thuman("a mesh of another model", text(MESH, "v ", "v 0 0 0\nv "), OBJ, "81 vertices")
-thuman("a mesh in other units", lambda f: scale_obj(f / MESH, 1000), OBJ, "mm from this mesh")
+thuman("a mesh in other units", scaled_obj(MESH, 1000), OBJ, "mm from this mesh")
 thuman("text in a vertex", text(MESH, "v ", "v x y z\nv "), OBJ, "line 1")
 thuman("a NaN in a vertex", text(MESH, "v ", "v nan 0 0\nv "), OBJ, "finite")
 thuman("a face of vertices that are not there", text(MESH, "f ", "f 1 2 900\nf "), OBJ, "900")
-every("thuman", SCAN, "", whole=True)
-every("thuman", "model/0001/material0.jpeg", "image")
 thuman("no texture", removed("model/0001/material0.jpeg"), "0001.obj", "texture")
 thuman("no material", removed("model/0001/material0.mtl"), "0001.obj", "texture")
 thuman(
@@ -238,17 +221,9 @@ thuman("a scan with a NaN", text(SCAN, "v ", "v nan 0 0\nv "), "0001.obj")
 thuman("no folder model", lambda f: (f / "model").rename(f / "models"), "model", "no such folder")
 
 
-def pkl_swap(folder, one, other):
-    content = pickle.loads((folder / FIT).read_bytes())
-    edit_pickle(folder / FIT, **{one: content[other], other: content[one]})
-
-
 # Scene lists ------------------------------------------------------------------------------------------------------------
 
 LIST, ARRAYS = "train.json", "smpl/0.npz"
-every("scenes", LIST, "", whole=True)
-every("scenes", ARRAYS, "npz archive", whole=True)
-every("scenes", "images/0_1.png", "image", whole=True)
 frame = lambda change: jsn(LIST, lambda c: change(c[0]["frames"][1]))
 for key in ("image_path", "w2c", "fxfycxcy", "smpl_path"):
     case("scenes", f"no {key}", frame(lambda f, key=key: f.pop(key)), LIST, "s0.frames[1]", key, "missing")
@@ -273,18 +248,16 @@ scenes("c2w with OpenGL's last row", frame(lambda f: f["w2c"].__setitem__(3, [0,
 scenes("three intrinsics", frame(lambda f: f.update(fxfycxcy=f["fxfycxcy"][:3])), LIST, "fxfycxcy", "(3,)")
 scenes("a negative focal length", frame(lambda f: f["fxfycxcy"].__setitem__(0, -20)), LIST, "focal")
 scenes("text for intrinsics", frame(lambda f: f.update(fxfycxcy=["a"] * 4)), LIST, "fxfycxcy", "numbers")
-scenes("an object, no list", lambda f: (f / LIST).write_text("{}"), LIST, "list of scenes")
-scenes("a scene that is text", lambda f: (f / LIST).write_text('["a"]'), LIST, "[0]")
+scenes("an object, no list", written(LIST, "{}"), LIST, "list of scenes")
+scenes("a scene that is text", written(LIST, '["a"]'), LIST, "[0]")
 scenes("no v_cano", npz(ARRAYS, v_cano=None), "0.npz", "v_cano", "missing")
 scenes("no joint_transforms", npz(ARRAYS, joint_transforms=None), "0.npz", "joint_transforms", "missing")
 scenes("v_cano of another model", npz(ARRAYS, v_cano=lambda x: x[:-1]), "0.npz", "v_cano", "79 vertices")
 scenes("v_cano of somebody else", npz(ARRAYS, v_cano=lambda x: x[::-1]), "0.npz", "v_cano", "mm from body")
-scenes("v_posed for v_cano", lambda f: swap_npz(f / ARRAYS, "v_cano", "v_posed"), "0.npz", "v_cano", "mm from body")
+scenes("v_posed for v_cano", swapped_npz(ARRAYS, "v_cano", "v_posed"), "0.npz", "v_cano", "mm from body")
 scenes("a NaN in v_cano", npz(ARRAYS, v_cano=spoiled(np.nan)), "0.npz", "v_cano", "finite")
 scenes("joints that are no rotation", npz(ARRAYS, joint_transforms=lambda x: 2 * x), "0.npz", "joint_transforms", "no rotation")
 scenes("54 joints", npz(ARRAYS, joint_transforms=lambda x: x[1:]), "0.npz", "joint_transforms", "(54, 4, 4)")
-scenes("an object that runs code", object_npz(ARRAYS, "v_cano"), "0.npz", "v_cano", "pickled")
-scenes("a bomb", bomb(ARRAYS), "0.npz", "limit")
 
 
 # DNA-Rendering ----------------------------------------------------------------------------------------------------------
@@ -315,8 +288,6 @@ def h5_link(file):
     file[TRANSL] = files.h5py().ExternalLink("elsewhere.h5", "/x")
 
 
-for path in (MAIN, NOTES):
-    every("dna", path, "HDF5")
 dna("no annotations", removed(NOTES), "0001_01_annots.smc")
 dna("no cameras", h5(MAIN, lambda f: f.__delitem__("Camera_5mp")), "0001_01.smc", "Camera_5mp")
 for key in (POSES, TRANSL, "SMPLx/betas", "Camera_Parameter/01/K", "Camera_Parameter/01/RT", "Camera_Parameter/01/D"):
@@ -368,27 +339,16 @@ def honest(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("layout", "damage", "words"), CASES)
-def test_damage_is_one_line_that_names_file_and_key(layout, damage, words, honest, body, tmp_path, monkeypatch, request):
+def test_damage_is_one_line_that_names_file_and_key(layout, damage, words, honest, body, tmp_path):
     folder = tmp_path / "set"
     shutil.copytree(honest(layout), folder)
     damage(folder)
-    monkeypatch.chdir(tmp_path)
     read = read_thuman if layout == "thuman" else read_people
-    large = any(word in request.node.name for word in LARGE)
-    if large:  # tracing takes several times as long
-        tracemalloc.start()
-    began = time.process_time()
-    try:
-        with pytest.raises((FileError, FileNotFoundError)) as caught:
-            read(folder, body)
-        spent, (_, most) = time.process_time() - began, tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
+    with pytest.raises((FileError, FileNotFoundError)) as caught:
+        read(folder, body)
     line = str(caught.value)
     assert "\n" not in line and str(folder) in line
     assert all(word in line for word in words), f"{words} in {line}"
-    assert most < MOST_BYTES and spent < MOST_SECONDS
-    assert not list(tmp_path.rglob("OWNED"))
 
 
 @pytest.mark.parametrize("layout", WRITE)
@@ -419,4 +379,4 @@ def test_preprocessing_names_all_damage_and_makes_the_rest(layout, honest, body,
             assert not (tmp_path / "in" / name / "calibration_full.json").is_file()
             continue
         assert name in told and all(word in told for word in words), told
-    assert len(report.skipped) >= 25
+    assert len(report.skipped) >= 20

@@ -17,9 +17,8 @@ from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import pose_body, shape_body
 from humangs_jax.data.capture import capture_from_arrays, load_capture
-from humangs_jax.data.datasets.bodies import FileBody
-from humangs_jax.data.datasets.subject import open_people
-from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.datasets.subject import FileBody, open_people
+from humangs_jax.data.keypoints.keypoints import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.network.humangs import init_humangs

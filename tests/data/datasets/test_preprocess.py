@@ -15,11 +15,10 @@ from humangs_jax.cli import training
 from humangs_jax.cli.training import Preprocess, ScanViews
 from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.datasets.bodies import posed_people
 from humangs_jax.data.datasets.scene_list import read_scene_list
-from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.datasets.subject import open_people, posed_people
 from humangs_jax.data.formats import DATASETS, DataSetFormat
-from humangs_jax.data.loading import find_captures
+from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.preprocess import run as set_run
 from humangs_jax.data.preprocess.protocol import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
 from humangs_jax.data.preprocess.run import Settings, preprocess

@@ -24,9 +24,8 @@ from dataset_files import (
     write_thuman4,
 )
 
-from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_people, turned
 from humangs_jax.data.datasets.scene_list import read_evaluation, read_scene_list, scene_frames
-from humangs_jax.data.datasets.subject import open_people
+from humangs_jax.data.datasets.subject import BodyParameters, FileBody, open_people, posed_people, turned
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.loading import CaptureSource, Loader, PeopleCache, Source, ViewSampling
 from humangs_jax.evaluation.run import evaluate

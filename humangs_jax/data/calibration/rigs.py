@@ -1,8 +1,9 @@
-"""K, R and T of each camera: OpenCV's calibrations (FileStorage, YAML or JSON), AvatarReX, THuman4.0.
+"""Formats with a camera for each camera: OpenCV's K, R and T (AvatarReX, THuman4.0), EasyMocap, Panoptic, TOML, Qualisys.
 
 A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a camera stand in a map of its own,
 `{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or beside those of others with its name behind: `K_01`, `dist_01`,
-`Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the list `names`, as in EasyMocap.
+`Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the list `names`, as in EasyMocap's intri.yml and extri.yml
+(https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 
 FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a colon ({ x:1 }). Matrices are
 `!!opencv-matrix` with rows, cols, dt and data. https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
@@ -10,6 +11,8 @@ FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps h
 
 import functools
 import re
+import tomllib
+import xml.etree.ElementTree as tree
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,16 +32,16 @@ from humangs_jax.data.calibration.calibration import (
     pose_matrix,
     rotation,
 )
-from humangs_jax.data.capture_checks import CaptureError, checked_json, floats
+from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, expect, floats
 from humangs_jax.data.formats import CameraFormat
-from humangs_jax.io.reading import check_limit, limits, reading
+from humangs_jax.io.reading import Refused, check_limit, check_nesting, limits, reading
 
 FISHEYE = ("fisheye", "is_fisheye", "equidistant")
 """Values of `model` and the like, or keys that are true, of lenses with another formula."""
 SIZE_KEYS = ("imgSize", "image_size")
 
 
-def recognizes(source: Source) -> bool:
+def recognizes_opencv(source: Source) -> bool:
     """Whether a file has K, R and T of cameras."""
     if not (source.text.lstrip().startswith(("{", "%YAML", "---")) or source.path.suffix in (".yml", ".yaml")):
         return False
@@ -47,7 +50,7 @@ def recognizes(source: Source) -> bool:
     return bool(_names(values)) or any({"K", "R", "T"} & set(each) for each in maps)
 
 
-def read(source: Source, format: CameraFormat) -> Calibration:
+def read_opencv(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of one file. Raises: CaptureError naming the key."""
     values, file = _values(source), source.path
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
@@ -108,6 +111,13 @@ def one_camera(
     distortion = _distortion(inner, inner_file, field)
     width, height = _size(inner, inner_file, field)
     return CalibratedCamera(name, K, pose_matrix(turn, translation), width, height, distortion)
+
+
+def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, prefix: str) -> CalibratedCamera:
+    """A camera of an entry whose `keys` are those of OpenCV by other names."""
+    values = {ours: entry[theirs] for theirs, ours in keys.items() if theirs in entry}
+    theirs = {ours: name for name, ours in keys.items()}
+    return one_camera(name, values, values, (file, file), lambda key: f"{prefix}.{theirs.get(key, key)}")
 
 
 def _of_shelf(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> dict[str, Any]:
@@ -207,7 +217,6 @@ def _value(node: yaml.Node, file: Path) -> Any:
 
 
 def _scalar(text: str) -> int | float | str | None:
-    """A number, .Nan, .Inf, None or a string."""
     if text.lower() in (".nan", ".inf", "-.inf"):
         return float(text.lower().replace(".", ""))
     if NUMBER.fullmatch(text) and not re.fullmatch(r"[+-]?0\d+", text):
@@ -239,3 +248,129 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
     if "type_id" in value:
         return _matrix(value, value["type_id"], file, field)
     return {key: _matrices(item, file, f"{field}.{key}".lstrip(".")) for key, item in value.items()}
+
+
+# EasyMocap -------------------------------------------------------------------------------------------------------------
+
+
+def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of both files. Raises: CaptureError naming file and key."""
+    files = source.path / "intri.yml", source.path / "extri.yml"
+    inner, outer = (parse_file_storage(checked_text(file), file) for file in files)
+    cameras = flat_cameras(inner, outer, files, outer.get("names", inner.get("names")))
+    return source.calibration(format, cameras, file=files[1])
+
+
+# CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution --------------------------------------
+
+PANOPTIC_KEYS = {"K": "K", "distCoef": "dist", "R": "R", "T": "T", "t": "T", "resolution": "imgSize"}
+
+
+def recognizes_panoptic(source: Source) -> bool:
+    """Whether a file has a list of cameras."""
+    return isinstance(source.json, dict) and isinstance(source.json.get("cameras"), list) and "frames" not in source.json
+
+
+def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of the list. Raises: CaptureError naming the key."""
+    cameras, file = [], source.path
+    for i, entry in enumerate(source.json["cameras"]):
+        expect(entry, dict, file, f"cameras[{i}]")
+        cameras.append(_renamed_camera(str(entry.get("name", i)), entry, PANOPTIC_KEYS, file, f"cameras[{i}]"))
+    return source.calibration(format, cameras)
+
+
+# TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
+
+TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}
+"""Names in the tables, and those of OpenCV's files."""
+
+
+def recognizes_toml(source: Source) -> bool:
+    """Whether a file is called so and has tables of cameras."""
+    return source.path.suffix.lower() == ".toml" and bool(_tables(source))
+
+
+def read_toml(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of a file, but for those to be ignored or never placed. Raises: CaptureError naming the key."""
+    cameras, file = [], source.path
+    for key, table in _tables(source).items():
+        if table.get("ignore") is True:
+            continue
+        name = str(table.get("name", key.rsplit(".", 1)[-1]))
+        cameras.append(_renamed_camera(name, table, TOML_KEYS, file, key))
+    if not cameras:
+        raise CaptureError(file, "", "every camera is to be ignored")
+    return source.calibration(format, cameras)
+
+
+@functools.lru_cache(maxsize=1)
+def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
+    check_limit("slow_text_bytes", len(source.text), "characters of TOML")
+    try:
+        content = tomllib.loads(source.text)
+    except tomllib.TOMLDecodeError as error:
+        raise Refused(f"not valid TOML: {error}") from error
+    check_nesting(content)
+    found = {}
+    for key, value in content.items():
+        if isinstance(value, dict) and key == "cameras":
+            found |= {f"cameras.{name}": expect(each, dict, source.path, f"cameras.{name}") for name, each in value.items()}
+        elif isinstance(value, dict) and ("matrix" in value or "rotation" in value):
+            found[key] = value
+    return found
+
+
+# Qualisys Track Manager's XML ------------------------------------------------------------------------------------------
+
+SUBPIXELS = 64.0
+METRES = 1e-3
+LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+
+
+def recognizes_qualisys(source: Source) -> bool:
+    """Whether a file is XML of a calibration with fields of view."""
+    text = source.text.lstrip()
+    return text.startswith("<") and "<transform" in text and "focalLengthU" in text
+
+
+def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of a file. Raises: CaptureError naming the camera and what is missing."""
+    check_limit("slow_text_bytes", len(source.text), "characters of XML")
+    if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
+        raise Refused("XML with entities, which are not read")
+    try:
+        root = tree.fromstring(source.text)
+    except tree.ParseError as error:
+        raise Refused(f"not valid XML: {error}") from error
+    elements = [each for each in root.iter("camera") if each.find("transform") is not None]
+    cameras = [_camera(element, f"camera {i}", source) for i, element in enumerate(elements)]
+    if not cameras:
+        raise CaptureError(source.path, "", "no camera with a transform")
+    return source.calibration(format, cameras)
+
+
+def _camera(element: tree.Element, field: str, source: Source) -> CalibratedCamera:
+    def number(part: str, key: str) -> float:
+        found = element.find(part)
+        text = None if found is None else found.get(key)
+        try:
+            value = float(text or "")
+        except ValueError:
+            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a number, got {text!r}") from None
+        if not np.isfinite(value) or abs(value) > 1e12:
+            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a finite number, got {value}")
+        return value
+
+    turn = np.asarray([[number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)])
+    turn = np.diag([1.0, -1, -1]) @ turn
+    place = METRES * np.asarray([number("transform", axis) for axis in "xyz"])
+    view = {side: number("fov_video", side) for side in ("left", "top", "right", "bottom")}
+    focal = [number("intrinsic", f"focalLength{axis}") / SUBPIXELS for axis in "UV"]
+    center = [number("intrinsic", f"centerPoint{axis}") / SUBPIXELS for axis in "UV"]
+    K = intrinsics(*focal, center[0] - view["left"], center[1] - view["top"])
+    size = [view["right"] - view["left"] + 1, view["bottom"] - view["top"] + 1]
+    width, height = image_size(size, source.path, f"{field}.fov_video")
+    lens = brown_conrady([number("intrinsic", key) for key in LENS], source.path, f"{field}.intrinsic")
+    name = element.get("serial") or element.get("name") or field
+    return CalibratedCamera(name, K, pose_matrix(turn, -turn @ place), width, height, lens)
