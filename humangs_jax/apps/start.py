@@ -13,7 +13,7 @@ import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import Float, PyTree
-from humangs_jax.data.calibration.photos import SUFFIXES, is_photo
+from humangs_jax.data.calibration.photos import SUFFIXES, is_photo, is_transparent
 from humangs_jax.data.calibration.videos import (
     LONGER_SIDE,
     PHOTOS,
@@ -33,7 +33,7 @@ from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import image_size, open_image
+from humangs_jax.io.images import image_size
 from humangs_jax.io.reading import read_json, reading, walk, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
@@ -112,7 +112,7 @@ def look(folder: Path, *, cameras: Path | None = None, masks: Path | None = None
         size=image_size(photos[0]),
         cameras=cameras or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
         masks=masks or next((place for name in MASK_FOLDERS if any(find_photos(place := folder / name))), None),
-        alpha=_has_alpha(photos[0]),
+        alpha=is_transparent(photos[0]),
         keypoints=keypoints or next(iter([*named, *others]), None),
     )
 
@@ -196,14 +196,6 @@ def find_photos(folder: Path) -> Iterator[Path]:
         with reading(folder, "folder of photos", CaptureError):
             found = walk(folder, lambda path: path.name in others or (path / "capture.json").exists())
             yield from filter(is_photo, found)
-
-
-def _has_alpha(photo: Path) -> bool:
-    """Whether a photo has transparent pixels; an opaque alpha channel is no mask."""
-    with open_image(photo) as (image, _):
-        if "A" not in image.getbands() and "transparency" not in image.info:
-            return False
-        return image.convert("RGBA").getchannel("A").getextrema()[0] < 255
 
 
 # Photos of a video ----------------------------------------------------------------------------------------------------

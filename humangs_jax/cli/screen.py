@@ -17,7 +17,6 @@ import traceback
 import warnings
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
 
 from humangs_jax.cli import INTERRUPTED
 from humangs_jax.core import progress
@@ -108,17 +107,6 @@ and real errors of a program arrive as exceptions.
 """
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    say(warnings.formatwarning(message, category, filename, lineno, line).rstrip(), error=True)
-
-
 class _Handler(logging.Handler):
     """What libraries log, through the one door."""
 
@@ -146,7 +134,8 @@ def silence(verbose: bool) -> None:
 
     sys.unraisablehook = unraisable
     sys.excepthook = lambda *what: say("".join(traceback.format_exception(*what)).rstrip(), error=True)
-    warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
+    show = lambda *what, file=None, line=None: say(warnings.formatwarning(*what[:4], line).rstrip(), error=True)
+    warnings.showwarning = show  # ty: ignore[invalid-assignment]
     for stream in (sys.stdout, sys.stderr):  # what others print, such as --help; it may be no file
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

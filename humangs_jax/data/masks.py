@@ -60,11 +60,6 @@ class _Shift(NamedTuple):
     thin: float = 0.0
 
 
-def fit_mask(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "h w"], float]:
-    """`masks_at_edges` of one view."""
-    return masks_at_edges([image], [mask])[0]
-
-
 def masks_at_edges(
     images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> list[tuple[Float[np.ndarray, "h w"], float]]:

@@ -47,40 +47,30 @@ def usable_views(capture: Capture) -> Capture:
 
 
 def unusable_views(capture: Capture) -> dict[int, str]:
-    """The views whose mask is empty or hardly meets the posed body, and which of the two."""
+    """The views whose mask is empty or hardly meets what of the posed body is in the frame, and which of the two.
+
+    A body that is not finite is another fault, which whoever poses it names.
+    """
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
         return found
-    apart = [i for i, share in enumerate(shares_on_masks(capture)) if share < LEAST_SHARE and i not in found]
-    found |= dict.fromkeys(apart, "mask and posed body hardly meet (`humangs check` draws both)")
+    rotations, translations = np.asarray(capture.poses.rotations), np.asarray(capture.poses.translation)
+    frames = [int(frame) for frame in capture.frames]
+    points = surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS)
+    K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
+    for i, frame in enumerate(frames):
+        mask = np.asarray(capture.masks[i])
+        if i in found or not np.isfinite(points[frame]).all():
+            continue
+        x, y = points_in_image(points[frame], K[i], cam_from_world[i], *mask.shape[::-1]).astype(int).T
+        if not len(x) or (mask[y, x] > MASK_THRESHOLD).mean() < LEAST_SHARE:
+            found[i] = "mask and posed body hardly meet (`humangs check` draws both)"
     return dict(sorted(found.items()))
 
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
     """The views whose mask shows nobody."""
     return [i for i, mask in enumerate(() if masks is None else masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
-
-
-def shares_on_masks(capture: Capture) -> list[float]:
-    """For each view the share of the body in the frame that lies on the mask; 0 where none of it is in the frame.
-
-    1 for a body that is not finite: that is another fault, which whoever poses it names.
-    """
-    assert capture.masks is not None
-    rotations, translations = np.asarray(capture.poses.rotations), np.asarray(capture.poses.translation)
-    frames = [int(frame) for frame in capture.frames]
-    points = surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS)
-    K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
-    shares = []
-    for i, frame in enumerate(frames):
-        mask = np.asarray(capture.masks[i])
-        height, width = mask.shape
-        if not np.isfinite(points[frame]).all():
-            shares.append(1.0)
-            continue
-        x, y = points_in_image(points[frame], K[i], cam_from_world[i], width, height).astype(int).T
-        shares.append(float((mask[y, x] > MASK_THRESHOLD).mean()) if len(x) else 0.0)
-    return shares
 
 
 # Points on the skin ---------------------------------------------------------------------------------------------------

@@ -112,7 +112,8 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
         return cameras_of_moment(seen, height=height)
     if len(seen.photos) >= FEWEST_WITHOUT:
         rests = [[v for v in every if v != out] for out in every]
-        errors = [_quick_error(seen.select(rest)) for rest in rests]
+        some = map(seen.select, rests)  # without a look for mirrored views
+        errors = [_try(_cleaned(each), _mirror(each), np.zeros(len(each.points), bool)).error for each in some]
         out = int(np.argmin(errors))
         if errors[out] < MOMENT_WITHOUT:
             found = cameras_of_moment(seen.select(rests[out]), height=height)
@@ -158,11 +159,6 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
         medians,
         tuple(_warnings(seen, found.mirrored, height)),
     )
-
-
-def _quick_error(seen: PersonViews) -> float:
-    """The error of photos as one moment, without a look for mirrored views."""
-    return _try(_cleaned(seen), _mirror(seen), np.zeros(len(seen.points), bool)).error
 
 
 def _mirror(seen: PersonViews) -> Int[np.ndarray, " k"]:
@@ -215,10 +211,6 @@ def _focal_lengths(seen: PersonViews) -> tuple[Float[np.ndarray, " c"], Float[np
     return np.where(known, seen.focal, usual * diagonals), std
 
 
-def _centered(values: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-    return values - (weights[:, None] * values).sum(0) / weights.sum()
-
-
 def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
     """Evidence with left and right of some views exchanged, and cameras to start from."""
     focal, std = _focal_lengths(seen)
@@ -234,11 +226,12 @@ def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[n
     seen_hips = np.where((weights * hips).all(1, where=np.asarray(hips), keepdims=True), weights * hips, weights)
     rays = np.asarray([_ray(*own) for own in zip(points, seen_hips, focal, strict=True)])
     world = np.einsum("cab,ckb->cka", smallest_turns(OPTICAL_AXIS, rays), world)
-    world = np.asarray([_centered(*own) for own in zip(world, weights, strict=True)])
+    world = np.asarray([x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)])
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
     shape, rotations = align_views(world, weights)
-    noise = np.asarray([_person_size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
+    size = lambda p, w: float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
+    noise = np.asarray([size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
     offsets = np.einsum("cab,kb->cka", rotations, shape)
     places = np.stack([place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)])
     evidence = Evidence(points, weights, noise, world, focal, std, _bones(seen.names))
@@ -248,10 +241,6 @@ def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[n
 def _ray(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"], focal: float) -> Float[np.ndarray, "3"]:
     direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
     return direction / np.linalg.norm(direction)
-
-
-def _person_size(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"]) -> float:
-    return float(np.ptp(np.quantile(points[weights > 0], OUTER, axis=0), axis=0).max())
 
 
 def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:

@@ -95,13 +95,6 @@ def test_what_is_written_is_of_the_person_and_of_everybody(tmp_path):
     assert (tmp_path / "people.png").is_file()
 
 
-def test_two_photos_never_share_a_mask(tmp_path):
-    photos = same_people([photo("a.jpg", found(1, 90.0)), photo("a.png", found(2, 90.0))])
-    with pytest.raises(ValueError, match=r"a\.jpg and a\.png: both masks would be masks/a\.png"):
-        write_found(tmp_path, photos, 0)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     """Two photos of the demo's person and an empty one, of another size."""
@@ -125,14 +118,6 @@ def test_keypoints_and_masks_of_photos(photos, tmp_path, capsys):
         assert (mask & expected).sum() / (mask | expected).sum() > 0.9
         x, y = np.floor(keypoints.points[i]).astype(int).T
         assert expected[y, x].mean() > 0.9
-
-
-def test_nobody_in_any_photo_is_one_line(tmp_path, capsys):
-    (tmp_path / "photos").mkdir()
-    write_png(tmp_path / "photos" / "black.png", np.zeros((64, 64, 3)))
-    assert cli.execute(["detect", str(tmp_path / "photos"), "--out", str(tmp_path / "found")]) == cli.BAD_DATA
-    assert "error: no person in black.png: expected one" in capsys.readouterr().err
-    assert not (tmp_path / "found" / "keypoints.json").exists()
 
 
 def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):

@@ -1,4 +1,4 @@
-"""Each format as its tool writes it, from known points, read back exactly."""
+"""Each format as its tool writes it, from known points, read back exactly; names of views, and sets of points."""
 
 import json
 
@@ -17,8 +17,9 @@ from humangs_jax.data.keypoints.keypoints import (
     MEDIAPIPE_33,
     OPENPOSE_67,
     Keypoints,
+    hand_names,
 )
-from humangs_jax.data.keypoints.reading import read_keypoints
+from humangs_jax.data.keypoints.reading import match_views, read_keypoints
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
 CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")
@@ -330,3 +331,132 @@ def test_saving_checks_its_arguments(tmp_path):
         save_keypoints(tmp_path / "k.json", keypoints, NAMES[:2])
     with pytest.raises(ValueError, match="names: expected one for each of 2 views, got 3"):
         save_keypoints(tmp_path / "k.npz", keypoints, NAMES)
+
+
+# Views by name and number ----------------------------------------------------------------------------------------------
+
+CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "images_cam1_000012")
+
+
+@pytest.mark.parametrize(
+    "images, names, views",
+    [
+        (["back.jpg", "front.png", "other.png"], ("front", "back"), [1, 0, None]),
+        (["/a/b/my photo (1).JPG"], ("my_photo__1_",), [0]),
+        (["C:\\photos\\front.png"], ("front",), [0]),
+        (["front.v2.png", "front.v2"], ("front.v2",), "both"),
+        (["front.v2"], ("front.v2",), [0]),
+        (["cam1/000012.png", "cam0/000000.png"], CAMERAS, [3, 0]),
+        (["images/cam1/000012.png"], CAMERAS, [3]),
+        (["cam1_000000000012", "cam0_000000000000"], CAMERAS, [3, 0]),  # OpenPose on videos
+        (["cam1/12"], CAMERAS, [3]),  # MMPose on videos
+        (["000012.png"], CAMERAS, [None]),  # of which camera?
+        # a video's frames from 0 and photos from 1, or the other way round: in order, for each video by itself
+        (["f_000000000000", "f_000000000001", "f_000000000002"], ("f_001", "f_002", "f_003"), [0, 1, 2]),
+        (["f_1", "f_3", "f_2"], ("f_000", "f_001", "f_002"), [0, 2, 1]),
+        (["b/0", "a/1", "b/1", "a/2"], ("v_a_1", "v_b_1", "v_a_2", "v_b_2"), [1, 0, 3, 2]),
+        (["a_0.jpg", "a_1.jpg", "b_0.jpg", "b_1.jpg"], ("a_1", "a_2", "b_0", "b_1"), [0, 1, 2, 3]),
+        (["0", "1"], ("000001", "000002"), [0, 1]),
+        # who knows: the numbers as they are
+        (["f_0", "f_1", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 0, 1, 2]),
+        (["f_0", "f_1"], ("f_1", "f_2", "f_3"), [None, 0]),
+        (["f_0", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 1, 2]),
+        (["cam_2", "cam_3"], ("cam_1", "cam_2"), [1, None]),
+        (["cam_0"], ("cam_1",), [None]),
+        (["frame_0"], ("0",), [None]),
+        (["1"], ("cam_1", "11"), [None]),
+        (["cam0/000000", "cam1/000000"], ("000000",), "both"),
+        (["01", "1"], ("1", "01"), [1, 0]),  # as written, before numbers as numbers
+    ],
+)
+def test_names(images, names, views):
+    if views == "both":
+        with pytest.raises(ValueError, match=f"are both for view '{names[0]}'"):
+            match_views(images, names)
+    else:
+        assert match_views(images, names) == views
+
+
+@pytest.mark.parametrize(
+    "numbers, names, views",
+    [
+        ([139, 285], ("000000000285", "000000000139"), [1, 0]),
+        ([3, 1], ("cam_1", "cam_2"), [None, 0]),
+        ([0, 1, 2], ("f_001", "f_002", "f_003"), [0, 1, 2]),  # ffmpeg counts from 1
+        ([1, 2, 3], ("f_000", "f_001", "f_002"), [0, 1, 2]),
+        ([0, 1, 2, 3], ("f_001", "f_002", "f_003"), [None, 0, 1, 2]),  # who knows: the numbers as they are
+        ([0, 2, 3], ("f_001", "f_002", "f_003"), [None, 1, 2]),  # gaps
+        ([5], ("front", "back"), [None]),
+        ([], ("front",), []),
+    ],
+)
+def test_numbers(numbers, names, views):
+    assert match_views(numbers, names) == views
+
+
+def test_numbers_of_several_cameras_are_refused():
+    with pytest.raises(ValueError, match=r"number 12 could be view 'images_cam0_000012' and 'images_cam1_000012'"):
+        match_views([12], CAMERAS)
+
+
+# Sets of points --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67), (MEDIAPIPE_33, 33)])
+def test_names_are_different_and_mirrors_are_mutual(keypoint_set, count):
+    assert len(keypoint_set.names) == len(set(keypoint_set.names)) == len(keypoint_set.mirror) == count
+    assert KEYPOINT_SETS[keypoint_set.name] is keypoint_set
+    for i, j in enumerate(keypoint_set.mirror):
+        assert keypoint_set.mirror[j] == i
+        name, other = keypoint_set.names[i], keypoint_set.names[j]
+        if name.startswith("left_"):
+            assert other == "right_" + name.removeprefix("left_")
+        elif not name.startswith(("right_", "face_")):
+            assert other == name
+
+
+def test_points_are_where_the_tools_have_them():
+    """Numbers from COCO's, COCO-WholeBody's and OpenPose's pages."""
+    for keypoint_set, numbers in (
+        (COCO_17, {0: "nose", 1: "left_eye", 4: "right_ear", 9: "left_wrist", 12: "right_hip", 16: "right_ankle"}),
+        (
+            COCO_WHOLEBODY_133,
+            {17: "left_big_toe", 19: "left_heel", 20: "right_big_toe", 22: "right_heel", 23: "face_0", 90: "face_67"}
+            | {91: "left_hand_root", 95: "left_thumb_tip", 96: "left_index_1", 112: "right_hand_root"}
+            | {132: "right_pinky_tip"},
+        ),
+        (
+            OPENPOSE_67,
+            {1: "neck", 2: "right_shoulder", 4: "right_wrist", 5: "left_shoulder", 8: "mid_hip", 9: "right_hip"}
+            | {14: "left_ankle", 15: "right_eye", 18: "left_ear", 19: "left_big_toe", 24: "right_heel"}
+            | {25: "left_hand_root", 46: "right_hand_root", 66: "right_pinky_tip"},
+        ),
+        (
+            MEDIAPIPE_33,
+            {0: "nose", 2: "left_eye", 5: "right_eye", 8: "right_ear", 11: "left_shoulder", 16: "right_wrist"}
+            | {17: "left_pinky_1", 20: "right_index_1", 22: "right_thumb_2", 24: "right_hip", 28: "right_ankle"}
+            | {1: "face_42", 6: "face_36", 9: "face_54", 30: "right_heel", 32: "right_foot_index"},
+        ),
+    ):
+        for i, name in numbers.items():
+            assert keypoint_set.names[i] == name
+
+
+@pytest.mark.parametrize(
+    "a, b",
+    [
+        *((0, 16), (8, 8), (17, 26), (21, 22), (27, 27), (30, 30), (31, 35), (33, 33)),
+        *((36, 45), (39, 42), (37, 44), (41, 46), (40, 47)),
+        *((48, 54), (51, 51), (55, 59), (57, 57), (60, 64), (62, 62), (65, 67), (66, 66)),
+    ],
+)
+def test_landmarks_of_the_face_mirror_as_in_300w(a, b):
+    names = COCO_WHOLEBODY_133.names
+    assert COCO_WHOLEBODY_133.mirror[names.index(f"face_{a}")] == names.index(f"face_{b}")
+
+
+def test_fingers_go_from_the_palm_outwards():
+    assert hand_names("right")[:6] == (
+        *("right_hand_root", "right_thumb_1", "right_thumb_2", "right_thumb_3"),
+        *("right_thumb_tip", "right_index_1"),
+    )

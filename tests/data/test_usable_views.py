@@ -1,17 +1,24 @@
-"""Views whose mask does not show the person are left out by name, wherever photos are read."""
+"""Photos before they are used: views left out whose mask does not show the person, few of many, in equal exposure."""
 
 import dataclasses
+import itertools
 import logging
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from humangs_jax.apps.settings import Settings
+from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
+from humangs_jax.data import views as module
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.usable_views import _sampling, shares_on_masks, usable_views
-from humangs_jax.data.views import select_views, standardize
+from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, exposures, gains_of, multiplied, with_gains
+from humangs_jax.data.usable_views import _sampling, unusable_views, usable_views
+from humangs_jax.data.views import greedy_cover, select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
 
 
@@ -67,8 +74,9 @@ def test_other_masks_are_kept(demo, mask):
     assert usable_views(capture) is capture
 
 
-def test_exact_masks_hold_the_body(demo):
-    assert min(shares_on_masks(demo)) > 0.95
+def test_exact_masks_hold_the_body(demo, monkeypatch):
+    monkeypatch.setattr("humangs_jax.data.usable_views.LEAST_SHARE", 0.95)
+    assert not unusable_views(demo)
 
 
 def test_points_are_spread_by_the_area_of_the_skin():
@@ -102,3 +110,176 @@ def test_no_view_left_is_an_error_that_names_them(demo):
     for read in (usable_views, lambda c: select_views(c, 2), lambda c: standardize(c, 64), crop_to_person):
         with pytest.raises(CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"):
             read(nobody)
+
+
+# Which photos of many to use -------------------------------------------------------------------------------------------
+
+GUARANTEE = 1 - 1 / np.e
+"""Of the greedy choice for a monotone submodular function."""
+
+
+def covered(quality, rows):
+    return quality[list(rows)].max(axis=0).sum()
+
+
+@given(arrays(float, (6, 5), elements=st.floats(0, 1)), st.integers(1, 4))
+def test_the_greedy_choice_keeps_its_guarantee(quality, count):
+    chosen = greedy_cover(quality, count)
+    assert len(set(chosen)) == count
+    best = max(covered(quality, rows) for rows in itertools.combinations(range(6), count))
+    assert covered(quality, chosen) >= GUARANTEE * best - 1e-9
+
+
+@pytest.mark.slow
+def test_repeated_photos_are_left_out(demo):
+    """Of four photos, three of which are one, two different ones show more."""
+    doubled = demo.select([0, 0, 2, 0])
+    chosen = select_views(doubled, 2)
+    assert 2 in chosen and len(set(chosen)) == 2
+
+
+def test_a_photo_without_the_person_is_not_chosen(demo):
+    views = demo.select(range(4))
+    empty = views.masks.copy()
+    empty[1] = 0
+    empty[1, :8, :8] = 1  # an empty mask would be no mask
+    chosen = select_views(dataclasses.replace(views, masks=empty), 3)
+    assert chosen == [0, 2, 3]
+
+
+def test_few_photos_are_all_taken_and_none_is_refused(demo):
+    assert select_views(demo.select(range(3)), 5) == [0, 1, 2]
+    with pytest.raises(ValueError, match="at least 1 photo, got 0"):
+        select_views(demo, 0)
+
+
+def test_without_a_number_what_adds_nothing_is_left_out(demo):
+    """Photos from four sides add something each; their copies do not."""
+    assert select_views(demo, None) == [0, 1, 2, 3]
+    assert len(select_views(demo.select([0, 2, 0, 2]), None)) == 2
+
+
+@given(arrays(float, (6, 5), elements=st.floats(0, 1)), st.floats(0, 1))
+def test_the_choice_ends_where_the_gain_does(quality, least):
+    chosen = greedy_cover(quality, 6, least)
+    sums = [covered(quality, chosen[: i + 1]) for i in range(len(chosen))]
+    assert all(later >= (1 + least) * earlier for earlier, later in itertools.pairwise(sums))
+    rest = [covered(quality, [*chosen, row]) for row in range(6) if row not in chosen]
+    assert all(more < (1 + least) * sums[-1] for more in rest)
+
+
+def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
+    doubled, away = demo.select([0, 0, 2, 2]), 1.5
+    matrices = np.array(doubled.cameras.cam_from_world)
+    matrices[::2, 2, 3] += away
+    capture = dataclasses.replace(doubled, cameras=replace(doubled.cameras, cam_from_world=jnp.asarray(matrices)))
+    body = decimate(capture.body, module.SELECTION_VERTICES)
+    quality = np.asarray(module.view_quality(body, standardize(capture, module.SELECTION_SIZE)))
+    for far, near in ((0, 1), (2, 3)):
+        both = (quality[far] > 0) & (quality[near] > 0)
+        distance = matrices[near, 2, 3]
+        # the rays of the nearer camera spread more, by some degrees
+        assert np.median(quality[far, both] / quality[near, both]) == pytest.approx(distance / (distance + away), rel=0.1)
+
+
+def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
+    """One photo shows the 60 % of the vertices with the smallest areas, the other one the others: more skin."""
+
+    def quality(body, views):
+        area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
+        small = area <= np.quantile(area, 0.6)
+        assert area[small].sum() < area[~small].sum()
+        return np.stack([small, ~small]).astype(float)
+
+    monkeypatch.setattr(module, "view_quality", quality)
+    assert select_views(demo.select([0, 1]), 1) == [1]
+
+
+# Equal exposure --------------------------------------------------------------------------------------------------------
+
+SHRINKING = 0.1
+"""Share of a gain that the prior keeps back where many points are shared."""
+POINTS = 4000
+
+
+def skin(rng, count=4, noise=0.05):
+    """Colors of common points in photos of equal exposure."""
+    own = rng.uniform(0.2, 0.7, (1, POINTS, 3))
+    return own * np.exp(noise * rng.normal(size=(count, POINTS, 3)))
+
+
+def centred(logs):
+    return logs - logs.mean(0)
+
+
+def test_known_gains_are_recovered():
+    rng = np.random.default_rng(0)
+    logs = centred(0.15 * rng.normal(size=(4, 3)))
+    found = np.log(gains_of(skin(rng) * np.exp(-logs)[:, None], np.ones((4, POINTS), bool)))
+    np.testing.assert_allclose(found, logs, atol=SHRINKING * np.abs(logs).max())
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-12)
+
+
+def test_fewer_points_give_gains_nearer_to_one():
+    noise = 0.1 * (np.arange(POINTS) % 3 - 1)[:, None]
+    colors = 0.4 * np.exp(np.stack([noise - 0.2, 0 * noise + 0.2]).repeat(3, axis=-1))
+    enough = [np.arange(POINTS) < points * np.ones((2, 1)) for points in (4000, 1000, 300, 100, 20)]
+    sizes = [np.abs(np.log(gains_of(colors, seen))).max() for seen in enough]
+    assert sizes[-1] == 0
+    assert all(fewer < more for more, fewer in itertools.pairwise(sizes))
+
+
+def test_gains_are_exactly_one_without_disagreement_or_without_common_points():
+    rng = np.random.default_rng(2)
+    np.testing.assert_array_equal(gains_of(skin(rng, noise=0.3), np.ones((4, POINTS), bool)), 1)
+    apart = np.arange(POINTS) * 4 // POINTS == np.arange(4)[:, None]
+    np.testing.assert_array_equal(gains_of(skin(rng) * np.asarray([0.7, 1, 1, 1.3])[:, None, None], apart), 1)
+
+
+def test_photos_with_nothing_in_common_are_not_moved_against_each_other():
+    """Two pairs of cameras on two sides: each pair agrees, and the pairs keep their means."""
+    rng = np.random.default_rng(3)
+    logs = np.repeat([[0.3], [0.1], [-0.1], [-0.3]], 3, axis=1)
+    seen = (np.arange(POINTS) < POINTS // 2) == np.asarray([True, True, False, False])[:, None]
+    found = np.log(gains_of(skin(rng) * np.exp(-logs)[:, None], seen))
+    np.testing.assert_allclose(found[:2] - found[:2].mean(0), [[0.1] * 3, [-0.1] * 3], atol=SHRINKING * 0.2)
+    np.testing.assert_allclose(found[:2].mean(0), 0, atol=1e-3 * EXPECTED + 1e-9)
+
+
+def test_outliers_do_not_count():
+    rng = np.random.default_rng(4)
+    colors, logs = skin(rng), centred(np.repeat([[0.2], [0.0], [0.0], [-0.2]], 3, axis=1))
+    colors[1, : POINTS // 5] *= 0.4  # a shadow
+    found = np.log(gains_of(colors * np.exp(-logs)[:, None], np.ones((4, POINTS), bool)))
+    np.testing.assert_allclose(found, logs, atol=2 * SHRINKING * 0.2)
+
+
+def test_a_synthetic_capture_stays_as_it_is(demo):
+    assert equal_exposure(demo) is demo
+
+
+def test_a_capture_in_different_exposures_is_made_equal_once(demo):
+    logs = centred(np.asarray([[0.15, 0.1, 0.1], [-0.15, -0.1, -0.2], [0.1, 0.2, 0.15], [-0.1, -0.2, -0.15]]))
+    changed = with_gains(demo, np.exp(-logs))
+    gains = camera_gains(changed)
+    left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))
+    assert left < 0.6 * before
+    np.testing.assert_allclose(exposures(changed) * gains, 1, rtol=1e-12)
+    equal = equal_exposure(changed)
+    assert equal_exposure(equal) is equal
+    outside = demo.masks == 0
+    np.testing.assert_array_equal(equal.images[outside], 1)
+    # what a camera would have shown: the gains undone
+    back = multiplied(equal.images, equal.masks, 1 / gains)
+    unclipped = (equal.images < 1).all(-1) & (demo.masks > 0)
+    np.testing.assert_allclose(back[unclipped], changed.images[unclipped], atol=1e-5)
+
+
+def test_without_masks_nothing_is_changed(demo):
+    bare = dataclasses.replace(demo, masks=None)
+    assert equal_exposure(bare) is bare
+    np.testing.assert_array_equal(exposures(bare), 1)
+    nobody = dataclasses.replace(demo, masks=np.zeros_like(demo.masks))
+    np.testing.assert_array_equal(exposures(nobody), 1)
+    with pytest.raises(ValueError, match="masks"):
+        with_gains(bare, np.ones((demo.view_count, 3)))

@@ -3,7 +3,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from seen_people import NOISE, body, person
+from fit_people import NOISE, default_body, person
 
 from humangs_jax.apps import check as module
 from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet, plot_over_time
@@ -209,7 +209,7 @@ def test_warnings_stay_few():
 
 
 def record_of(capture, keypoints, order, **changes):
-    shape = (FRAMES, len(body().joint_names))
+    shape = (FRAMES, len(default_body().joint_names))
     values: dict = dict(noise=np.full(FRAMES, 2.0), joint_std=np.full(shape, 0.001), determined=np.ones(shape))
     values |= {"shape_covariance": np.eye(4)} | changes
     names = tuple(capture.names[i] for i in order)
@@ -219,7 +219,7 @@ def record_of(capture, keypoints, order, **changes):
 
 def test_a_record_is_brought_into_the_order_of_the_views(good):
     capture, keypoints = good
-    joint_std = np.full((FRAMES, len(body().joint_names)), 0.001)
+    joint_std = np.full((FRAMES, len(default_body().joint_names)), 0.001)
     joint_std[:, JOINT_NAMES.index("jaw")] = 1.0
     record = record_of(capture, keypoints, np.arange(FRAMES * VIEWS)[::-1], joint_std=joint_std)
     examination, found = examine_record(capture, record)

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fit_people import default_body
-from person_views import FOCAL, MIRROR, NAMES, cameras_around, errors_of, posed, seen_by
+from fit_people import FOCAL, MIRRORED, NAMES, cameras_around, default_body, errors_of, person, posed, seen_by
 
 from humangs_jax.apps.check import check_capture
 from humangs_jax.body.model import BodyPose, shape_body
@@ -20,7 +19,6 @@ from humangs_jax.fitting.fit_capture import examine, fit_photos
 from humangs_jax.fitting.person_cameras import SeveralMomentsError, cameras_from_person, cameras_of_moment, scaled_to_height
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from tests.fitting.seen_people import person
 
 EXACT_DEGREES, EXACT_METRES = 0.1, 0.01
 """Of exact landmarks: float32, and priors (size, level cameras) that are not quite those of the test's person."""
@@ -75,7 +73,7 @@ def test_a_mirrored_view_is_found(view):
     matrices = cameras_around(4)
     seen = seen_by(posed("crouching"), matrices, **NOISE | {"turn": 0.0})
     points, world = seen.points.copy(), seen.world.copy()
-    points[view], world[view] = points[view][MIRROR], world[view][MIRROR]
+    points[view], world[view] = points[view][MIRRORED], world[view][MIRRORED]
     found = cameras_from_person(dataclasses.replace(seen, points=points, world=world))
     assert found.mirrored.tolist() == [v == view for v in range(4)]
     assert errors_of(found, matrices)[0].mean() < NOISY_DEGREES

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toy_body import MODEL
+from fit_people import TOY_MODEL as MODEL
 
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyPose

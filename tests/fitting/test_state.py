@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fit_people import NAMES_WITHIN_LIMITS, rotations_of
-from toy_body import MODEL
+from fit_people import TOY_MODEL as MODEL
 
 from humangs_jax.apps import check
 from humangs_jax.avatar.export.gaussians import turned

@@ -1,12 +1,23 @@
+"""Joints by rays of several cameras; left and right exchanged in views."""
+
+import dataclasses
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fit_people import model_of, observe
+from fit_people import model_of, observe, person
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, Keypoints, hand_names
+from humangs_jax.data.photos import Photos
+from humangs_jax.fitting import swaps as module
 from humangs_jax.fitting import triangulation
+from humangs_jax.fitting.landmark_fit import FitConfig
+from humangs_jax.fitting.residuals.keypoints import group_by_frame
+from humangs_jax.fitting.swaps import find_exchanged_hands, find_mirrored, find_swaps
 from humangs_jax.fitting.triangulation import (
     Similarity,
     align_points,
@@ -15,6 +26,8 @@ from humangs_jax.fitting.triangulation import (
     triangulate,
     triangulate_robustly,
 )
+from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres
 KNOWN = np.asarray(model_of().known)
@@ -162,3 +175,248 @@ def test_similarities_compose_and_invert():
 def test_points_that_say_nothing_are_refused(points):
     with pytest.raises(ValueError, match="three points"):
         align_points(points, points, np.ones(len(points)))
+
+
+# Swaps -----------------------------------------------------------------------------------------------------------------
+
+MIRROR = list(COCO_17.mirror)
+
+
+def seen(capture, keypoints):
+    photos = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
+    return (*group_by_frame(photos, keypoints)[:1], keypoints.set, group_by_frame(photos, keypoints)[1])
+
+
+def found(capture, keypoints):
+    return find_swaps(*seen(capture, keypoints), capture.names)
+
+
+def changed(keypoints, order=None, flipped=()):
+    """Keypoints of views in another order, those of some mirrored."""
+    order = np.arange(len(keypoints.points)) if order is None else np.asarray(order)
+    points, confidences = keypoints.points[order].copy(), keypoints.confidences[order].copy()
+    for view in flipped:
+        points[view], confidences[view] = points[view][MIRROR], confidences[view][MIRROR]
+    return Keypoints(points, confidences, keypoints.set)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [2, 3, 4, 8])
+def test_nothing_is_found_where_nothing_is_wrong(views):
+    for seed in range(4):
+        assert found(*person(seed, 4, views, outliers=0.2)) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [3, 4, 8])
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_sides_of_single_views(views, outliers):
+    capture, keypoints = person(10, 4, views, outliers=outliers)
+    swapped = [1, views, 3 * views + 2]  # in frames 0, 1 and 3
+    swaps = found(capture, changed(keypoints, flipped=swapped))
+    assert {(swap.kind, swap.views, swap.instead) for swap in swaps} == {
+        ("sides", (capture.names[view],), ()) for view in swapped
+    }
+    assert all(0.3 < swap.gain < 1.1 for swap in swaps)
+    assert "view m1v0: left and right of the keypoints seem exchanged" in [str(swap) for swap in swaps]
+
+
+@pytest.mark.slow
+def test_of_two_views_either_may_be_the_wrong_one():
+    capture, keypoints = person(11, 4, 2)
+    swaps = found(capture, changed(keypoints, flipped=[0, 5]))
+    assert {frozenset((*swap.views, *swap.instead)) for swap in swaps} == {
+        frozenset(("m0v0", "m0v1")),
+        frozenset(("m2v0", "m2v1")),
+    }
+    assert "instead)" in str(swaps[0])
+
+
+def test_of_four_views_two_and_two():
+    capture, keypoints = person(12, 4, 4)
+    swaps = found(capture, changed(keypoints, flipped=[0, 3]))
+    assert len(swaps) == 2
+    assert {name for swap in swaps for name in (*swap.views, *swap.instead)} == {"m0v0", "m0v1", "m0v2", "m0v3"}
+    assert {frozenset(swap.views) for swap in swaps} in (
+        {frozenset(("m0v0",)), frozenset(("m0v3",))},
+        {frozenset(("m0v1",)), frozenset(("m0v2",))},
+    )
+
+
+@pytest.mark.parametrize("views", [3, 4, 8])
+def test_cameras_of_two_views(views):
+    capture, keypoints = person(13, 4, views, outliers=0.1)
+    order = np.arange(4 * views)
+    order[[0, 2]] = [2, 0]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.instead, swap.frames) == ("cameras", ("m0v0", "m0v2"), (), 1)
+    assert str(swap) == "the cameras (or the photos) of views m0v0 and m0v2 seem exchanged"
+
+
+def test_evenly_spaced_cameras_have_two_explanations():
+    """Half a turn of all cameras makes one exchange of opposite ones the other."""
+    capture, keypoints = person(13, 4, 4, even=True)
+    order = np.arange(16)
+    order[[0, 2]] = [2, 0]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert {" and ".join(swap.views), *swap.instead} == {"m0v0 and m0v2", "m0v1 and m0v3"}
+    assert str(swap).endswith("instead)")
+
+
+def test_cameras_of_two_views_cannot_be_told_from_two():
+    capture, keypoints = person(14, 4, 2)
+    assert all(swap.kind != "cameras" for swap in found(capture, changed(keypoints, [1, 0, 2, 3, 4, 5, 6, 7])))
+
+
+def test_cameras_that_stand_still_are_reported_once():
+    capture, keypoints = person(15, 4, 4, still=True, outliers=0.1)
+    order = (np.arange(16).reshape(4, 4)[:, [0, 3, 2, 1]]).ravel()
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.frames) == ("cameras", ("m0v1", "m0v3"), 4)
+    assert str(swap).endswith("seem exchanged, as in 4 frames")
+
+
+def test_photos_of_one_frame_are_exchanged_under_cameras_that_stand_still():
+    capture, keypoints = person(16, 4, 4, still=True)
+    order = np.arange(16)
+    order[[5, 6]] = [6, 5]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.frames) == ("cameras", ("m1v1", "m1v2"), 1)
+
+
+def test_both_at_once():
+    capture, keypoints = person(17, 4, 8)
+    order = np.arange(32)
+    order[[8, 12]] = [12, 8]
+    swaps = found(capture, changed(keypoints, order, flipped=[1, 10]))
+    assert {(swap.kind, swap.views) for swap in swaps} == {
+        ("cameras", ("m1v0", "m1v4")),
+        ("sides", ("m0v1",)),
+        ("sides", ("m1v2",)),
+    }
+
+
+def test_one_view_and_views_that_are_missing():
+    capture, keypoints = person(18, 4, 3)
+    alone = capture.select([0, 3, 6, 9])
+    assert found(alone, changed(keypoints, [0, 3, 6, 9], flipped=[1])) == ()
+    some = [0, 1, 2, 4, 5, 6, 7, 8, 9]  # frame 1 has two views, frame 3 has one
+    swaps = found(capture.select(some), changed(changed(keypoints, flipped=[8]), some))
+    assert [swap.views for swap in swaps] == [("m2v2",)]
+    blind = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
+    assert found(capture, blind) == ()
+
+
+@pytest.mark.parametrize(
+    "given, other, share", [(10.0, 5.0, 0.5), (10.0, 7.0, None), (1000.0, 900.0, 0.1), (1000.0, 950.0, None)]
+)
+def test_mirrored_people(monkeypatch, given, other, share):
+    """By what a fit to the mirrored keypoints costs; that it finds the people themselves is measured, not tested here."""
+    fit = lambda cost: types.SimpleNamespace(outcomes={"hands": types.SimpleNamespace(after=jnp.full(4, cost / 4))})
+    capture, keypoints = person(19, 4, 2)
+    observations, kind, _ = seen(capture, keypoints)
+    asked = []
+    monkeypatch.setattr(module, "fit_landmarks", lambda model, seen, config: asked.append(seen) or fit(other))
+    swaps = _unchecked(find_mirrored)(None, observations, kind, fit(given), FitConfig())
+    np.testing.assert_array_equal(asked[0].points, np.asarray(observations.points)[:, :, MIRROR])
+    assert len(swaps) == (share is not None)
+    for swap in swaps:
+        assert swap.kind == "all sides" and swap.gain == pytest.approx(share, abs=1e-6)
+        assert "in all views" in str(swap)
+
+
+def _unchecked(function):
+    """Without the check of types, which the stand-in of a fit would fail."""
+    return getattr(function, "__wrapped__", function)
+
+
+def test_hands_at_each_others_wrists():
+    _, keypoints = person(0, 2, 4, kind=COCO_WHOLEBODY_133)
+    names = tuple(f"view{i}" for i in range(8))
+    assert find_exchanged_hands(keypoints, names) == ()
+    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
+    points = keypoints.points.copy()
+    points[3, hands] = points[3, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
+    found = find_exchanged_hands(dataclasses.replace(keypoints, points=points), names)
+    assert [str(swap) for swap in found] == [
+        "view view3: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    ]
+    assert find_exchanged_hands(person(0, 1, 2)[1], names) == ()
+
+
+# People of several views are told apart by how their landmarks triangulate --------------------------------------------
+
+
+SIZE, NOISE = 512, 4.0
+"""Pixels of the photos and of the noise: a hundredth of a person's height."""
+AROUND = jnp.asarray([0.0, 1.3, 3.0, 4.4])
+"""Azimuths of the cameras: no two stand opposite each other."""
+MIRRORED = np.asarray(COCO_17.mirror)
+
+
+def seen_in(people, views=4, seed=0):
+    """Views of people (n, 17, 3) metres, each in another order; the order of view 0 is the given one."""
+    rng = np.random.default_rng(seed)
+    cameras = orbit(jnp.zeros(3), 3.5, AROUND[:views], 0.1, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)
+    found, orders = [], []
+    for v in range(views):
+        K, transform = np.asarray(cameras.K[v], float), np.asarray(cameras.cam_from_world[v], float)
+        local = people @ transform[:3, :3].T + transform[:3, 3]
+        pixels = (local @ K.T)[..., :2] / local[..., 2:] + rng.normal(0, NOISE, (*people.shape[:2], 2))
+        order = np.arange(len(people)) if v == 0 else rng.permutation(len(people))
+        rows = np.concatenate([pixels, np.ones((*people.shape[:2], 1))], axis=-1)[order]
+        found.append(Seen(K, transform, tuple(rows)))
+        orders.append(order)
+    return found, orders
+
+
+def somebody(seed, x=0.0):
+    """A standing person: left and right are 30 cm apart."""
+    rng = np.random.default_rng(seed)
+    height = np.asarray([0.8, *[0.85] * 2, *[0.8] * 2, *[0.6] * 2, *[0.3] * 2, *[0.05] * 2, *[0.0] * 2, *[-0.4] * 2])
+    height = np.concatenate([height, [-0.8] * 2])
+    side = np.asarray([0.0] + [1, -1] * 8) * np.asarray([0, *[0.04] * 4, *[0.2] * 2, *[0.3] * 4, *[0.13] * 6])
+    points = np.stack([side + x, height, rng.normal(0, 0.08, 17)], axis=-1)
+    return points + rng.normal(0, 0.03, (17, 3))
+
+
+@pytest.mark.parametrize("views", [2, 4])
+def test_two_people_are_matched_whatever_their_order(views):
+    people, orders = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), views)
+    matches = match_people(people, COCO_17.mirror)
+    assert len(matches) == 2
+    for match in matches:
+        assert len({int(orders[v][m]) for v, m in enumerate(match.members)}) == 1
+        assert not any(match.mirrored) and match.error < 0.03
+
+
+@pytest.mark.parametrize("wrong", [0, 2])
+def test_a_view_that_exchanges_left_and_right_is_found_by_the_others(wrong):
+    views, _ = seen_in(somebody(2)[None])
+    views[wrong] = views[wrong]._replace(people=(views[wrong].people[0][MIRRORED],))
+    (match,) = match_people(views, COCO_17.mirror)
+    assert match.members == (0, 0, 0, 0)
+    assert [i for i, mirrored in enumerate(match.mirrored) if mirrored] == [wrong]
+
+
+def test_somebody_whom_one_view_alone_shows_stays_alone():
+    views, _ = seen_in(somebody(3)[None])
+    stranger = somebody(4, 0.7)[:, :2] * [250, -250] + 256
+    views[1] = views[1]._replace(people=(np.c_[stranger, np.ones(17)], *views[1].people))
+    first, last = match_people(views, COCO_17.mirror)
+    assert first.members == (0, 1, 0, 0) and last.members == (None, 0, None, None)
+
+
+def test_nobody_and_one_view():
+    views, _ = seen_in(somebody(5)[None], views=1)
+    assert [match.members for match in match_people(views, COCO_17.mirror)] == [(0,)]
+    assert match_people([views[0]._replace(people=())], COCO_17.mirror) == []
+
+
+def test_people_are_followed_over_time_by_where_they_are():
+    at = lambda x: Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0]))
+    alone = Match((0, None), (False, False), float("inf"), np.full(3, np.nan))
+    a, b, later = in_order_of_time([[at(0.0), at(1.0)], [at(1.2), at(0.1)], [at(0.2), alone, at(5.0)]])
+    assert [m.center[0] for m in a if m] == [0.0, 1.0] and a[2:] == [None, None]
+    assert [m.center[0] for m in b if m] == [0.1, 1.2]
+    assert later[0].center[0] == 0.2 and later[1] is None and later[2] is alone and later[3].center[0] == 5.0

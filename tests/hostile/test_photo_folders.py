@@ -206,7 +206,7 @@ FOLDERS = {
     "nothing": (lambda folder: folder.mkdir(), None, "no photo: expected"),
     "a folder that is not there": (lambda folder: None, None, "no such folder"),
 }  # fmt: skip
-FAST = ("good", "one name with two suffixes", "a HEIC without the extra", "a photo cut short", "feet cut off", "nothing")
+FAST = ("good", "black", "one name with two suffixes", "a HEIC without the extra", "a photo cut short", "feet cut off", "nothing")
 
 
 @pytest.fixture(scope="module")

@@ -34,6 +34,7 @@ from humangs_jax.data.calibration.photos import (
     find_photos,
     find_turns,
     has_alpha,
+    is_transparent,
     photo_of,
     photo_size,
     turn_notes,
@@ -293,7 +294,7 @@ def _write(
     straight = all(camera.distortion is None for camera in calibration.cameras)
     rewrites = [turn.rewrites or turn.size != canvas or _of_phones(photo) for photo, turn in zip(photos, turns, strict=True)]
     changed = not straight or any(rewrites)
-    transparent = changed and any(_is_transparent(photo.image) for photo in photos)
+    transparent = changed and any(is_transparent(photo.image) for photo in photos)
     straight = straight and not transparent
     views, cut = [], []
     for photo, turn, name, rewritten in zip(photos, turns, names, rewrites, strict=True):
@@ -321,13 +322,6 @@ def _copy(folder: Path, photo: Photo, name: str) -> dict[str, str]:
         files["mask"] = f"masks/{name}{photo.mask.suffix}"
         shutil.copyfile(photo.mask, folder / files["mask"])
     return files
-
-
-def _is_transparent(photo: Path) -> bool:
-    if not read_checked(has_alpha, photo):
-        return False
-    alpha = read_checked(read_image, photo)[1]
-    return alpha is not None and bool(alpha.min() < 1)
 
 
 def _rewrite(

@@ -391,3 +391,9 @@ def has_alpha(photo: Path) -> bool:
     """Whether a photo has an alpha channel, opaque or not."""
     with open_image(photo) as (image, _):
         return "A" in image.getbands() or "transparency" in image.info
+
+
+def is_transparent(photo: Path) -> bool:
+    """Whether a photo has transparent pixels; an opaque alpha channel is no mask. Raises: CaptureError."""
+    alpha = read_checked(read_image, photo)[1] if read_checked(has_alpha, photo) else None
+    return alpha is not None and bool(alpha.min() < 1)

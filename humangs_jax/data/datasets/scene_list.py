@@ -132,7 +132,7 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
     def read(view: int):
         return _read_view(file, name, views[view])
 
-    sizes = np.asarray([_view_size(file, name, views[0])] * len(views))
+    sizes = np.asarray([read_checked(image_size, _inside(file, name, views[0].image))] * len(views))
     K, poses = np.stack([view.K for view in views]), np.stack([view.cam_from_world for view in views])
     for i in range(len(views)):
         checked_camera(K[i], poses[i], *sizes[i].tolist(), file, f"{name}.frames[{i}]")
@@ -206,10 +206,6 @@ def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[Scen
 def _inside(file: Path, name: str, path: Any) -> Path:
     with reading(f"{file}: {name}", "path", CaptureError):
         return inside(file.parent, path, photo=True)
-
-
-def _view_size(file: Path, name: str, view: SceneFrame) -> tuple[int, int]:
-    return read_checked(image_size, _inside(file, name, view.image))
 
 
 def _read_view(file: Path, name: str, view: SceneFrame) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:

@@ -223,7 +223,9 @@ def read_scan(file: str | Path) -> Scan:
         if uvs is None:
             raise Refused("no texture coordinates: expected a textured scan")
         if image is None or max(image.size) <= 2:  # trimesh leaves out what it cannot read, or puts a placeholder there
-            _find_fault(Path(file).parent)
+            for path in sorted(Path(file).parent.iterdir()):
+                if path.suffix.lower() in PHOTO_SUFFIXES:
+                    check_image(path)
             raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
         if uvs.shape != (len(vertices), 2):
@@ -233,10 +235,3 @@ def read_scan(file: str | Path) -> Scan:
                 raise Refused(f"{name}: expected finite numbers")
         texture = np.asarray(image.convert("RGB"))
         return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, texture)
-
-
-def _find_fault(folder: Path) -> None:
-    """Raises: FileError for the first image of a folder that cannot be read."""
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in PHOTO_SUFFIXES:
-            check_image(path)

@@ -29,7 +29,7 @@ def matched(names: Sequence[str], parents: Sequence[int], rest: Places, posed: P
     if hips := [source[name] for name in ("left_hip", "right_hip") if name in source][1:]:
         _place_pelvis(source, parents, (source["left_hip"], *hips))
     if any(name not in source for name in NEEDED) or not _descends(source, parents):
-        lengths = _lengths(parents, rest)
+        lengths = np.asarray([0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)])
         limbs = _limbs(plain, parents, lengths, posed)
         if limbs is None:
             missing = [name for name in NEEDED if name not in source]
@@ -103,10 +103,6 @@ def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
 
 
 # The tree ---------------------------------------------------------------------------------------------------------------
-
-
-def _lengths(parents: Sequence[int], rest: Places) -> np.ndarray:
-    return np.asarray([0.0 if p < 0 else np.linalg.norm(rest[i] - rest[p]) for i, p in enumerate(parents)])
 
 
 def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]:
