@@ -47,7 +47,7 @@ from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
-from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
 from humangs_jax.fitting.refine import refine_capture, usual_config
 from humangs_jax.network.weights import SHIPPED, load_weights

@@ -34,7 +34,7 @@ from experiments.results import markdown_table, significant
 from experiments.subjects import file_digest
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import FileBody
-from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.evaluation.scores import mean_scores
 from humangs_jax.io.reading import read_json
 from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.training.config import read_config

@@ -144,16 +144,16 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float | np
     return np.concatenate(points)
 
 
-def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.ndarray:
-    """The share of `views` parallel projections, in [0, 1], in which each vertex (n, 3) is not hidden."""
+def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is not hidden."""
     size = np.linalg.norm(np.ptp(vertices, axis=0))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
     columns = int(size / cell) + 3
     golden_angle = np.pi * (3 - np.sqrt(5))
     seen = np.zeros(len(vertices))
-    for i in range(views):
-        y = 1 - 2 * (i + 0.5) / views
+    for i in range(VIEWS):
+        y = 1 - 2 * (i + 0.5) / VIEWS
         radius = np.sqrt(1 - y * y)
         forward = np.array([radius * np.cos(golden_angle * i), y, radius * np.sin(golden_angle * i)])
         right = np.linalg.svd(forward[None])[2][1]
@@ -164,7 +164,7 @@ def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.
         buffer = np.full(columns * columns, np.inf)
         np.minimum.at(buffer, cells(right_of, above), depth)
         seen += own[2] < buffer[cells(own[0], own[1])] + 2 * cell
-    return seen / views
+    return seen / VIEWS
 
 
 class _Mesh:

@@ -1,6 +1,7 @@
 """One evaluator: people of any source, any method, any protocol -> scores of images, tables, and the page (report/)."""
 
 import base64
+import csv
 import dataclasses
 import functools
 import heapq
@@ -13,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,27 +31,18 @@ from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
 from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
 from humangs_jax.evaluation.scores import (
-    EvaluationProtocol,
-    find_protocol,
-    missing_reasons,
-    on_background,
-    score_names,
-    score_views,
-)
-from humangs_jax.evaluation.tables import (
-    COLUMNS,
     CONFIDENCE,
-    ORDER,
+    EvaluationProtocol,
     Mean,
     Row,
     Scored,
-    csv_text,
-    latex_table,
-    markdown_table,
+    find_protocol,
+    missing_reasons,
+    on_background,
     overall_means,
     person_means,
-    shown,
-    shown_mean,
+    score_names,
+    score_views,
 )
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.images import resized, to_uint8
@@ -67,6 +59,37 @@ QUALITY = 88
 LARGEST_ERROR = 0.25
 """Mean absolute difference of the channels that gets the last color."""
 _MARK = re.compile(r"\{\{(\w+)\}\}")
+
+
+ORDER = "mean over the images of a frame, then over the frames of a person, then over people"
+
+
+class Column(NamedTuple):
+    """How a score is shown. better: "up", "down" or ""."""
+
+    heading: str
+    digits: int
+    better: str
+
+
+COLUMNS = {
+    "psnr": Column("PSNR", 2, "up"),
+    "ssim": Column("SSIM", 4, "up"),
+    "lpips_vgg": Column("LPIPS vgg", 4, "down"),
+    "lpips_alex": Column("LPIPS alex", 4, "down"),
+    "lpips_squeeze": Column("LPIPS squeeze", 4, "down"),
+    "psnr_fg": Column("foreground PSNR", 2, "up"),
+    "psnr_boundary": Column("PSNR at the silhouette", 2, "up"),
+    "iou": Column("IoU", 4, "up"),
+    "semi_transparent": Column("semi_transparent", 4, "down"),
+    "foreground": Column("share of the person", 3, ""),
+    "patch_psnr": Column("PSNR of patches", 2, "up"),
+    "patch_ssim": Column("SSIM of patches", 4, "up"),
+    "patch_lpips_vgg": Column("LPIPS vgg of patches", 4, "down"),
+    "patch_lpips_alex": Column("LPIPS alex of patches", 4, "down"),
+    "patch_lpips_squeeze": Column("LPIPS squeeze of patches", 4, "down"),
+    "patches": Column("patches", 1, ""),
+}
 
 
 class Gallery:
@@ -397,3 +420,69 @@ def _plain(value: Any) -> Any:
         return list(value) if isinstance(value, tuple) else value
     fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     return fields if isinstance(value, EvaluationProtocol) else {"kind": type(value).__name__} | fields
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+def shown(value: float | None, name: str) -> str:
+    """A score with its digits; a dash for a missing one."""
+    return "-" if value is None else f"{value:.{COLUMNS[name].digits}f}"
+
+
+def shown_mean(mean: Mean | None, name: str) -> str:
+    """A mean with its interval in brackets."""
+    if mean is None:
+        return "-"
+    interval = "" if mean.low is None else f" [{shown(mean.low, name)}, {shown(mean.high, name)}]"
+    return shown(mean.mean, name) + interval
+
+
+_MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"}
+"""What would begin HTML, code or another cell; links are broken between text and address."""
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """The first column to the left, the others to the right."""
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    escape = lambda cell: "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace("](", "]\\(")
+    lines = (" | ".join(map(escape, row)) for row in (header, *rows))
+    first, *others = (f"| {line} |" for line in lines)
+    return "\n".join([first, f"| {' | '.join(rule)} |", *others]) + "\n"
+
+
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+
+
+def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A tabular with rules of the package booktabs."""
+    special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    line = lambda row: " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
+    body = "\n".join(line(row) for row in rows)
+    begin = f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
+    return f"{begin}{body}\n\\bottomrule\n\\end{{tabular}}\n"
+
+
+_FORMULAS = tuple("=+-@\uff1d\uff0b\uff0d\uff20")
+"""Signs that a formula begins with, those of full width too."""
+
+
+def csv_text(rows: Sequence[Scored]) -> str:
+    """One line an image, all digits; an empty cell for a missing score. Reads back with any spreadsheet.
+
+    Names that a spreadsheet would take for a formula begin with an apostrophe.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = list(rows[0].scores)
+    writer.writerow(["person", "frame", "view", *names])
+    for row in rows:
+        writer.writerow(
+            [_cell(row.person), row.frame, _cell(row.view), *("" if (x := row.scores[n]) is None else x for n in names)]
+        )
+    return text.getvalue()
+
+
+def _cell(name: str) -> str:
+    name = printable(name)
+    return f"'{name}" if name.lstrip()[:1] in _FORMULAS else name

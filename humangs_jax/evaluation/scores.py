@@ -11,8 +11,8 @@ count, and LPIPS sees zeros where its convolutions would.
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal, Protocol, runtime_checkable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,6 @@ from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.core.configuration import Presets
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of
-from humangs_jax.evaluation.tables import Row, mean_scores
 from humangs_jax.io.images import resized
 from humangs_jax.losses.losses import (
     GAUSSIAN,
@@ -180,6 +179,94 @@ def find_protocol(protocol: str | EvaluationProtocol) -> EvaluationProtocol:
     if protocol not in PROTOCOLS:
         raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
     return PROTOCOLS[protocol]
+
+
+# Means: first over the images of a frame, then over the frames of a person, then over people: a person counts once, however often
+# photographed. An interval is of the mean over people; with one person, over the frames; with one frame, over the images.
+
+Row = dict[str, float | None]
+"""Scores by name; None for what is missing."""
+CONFIDENCE = 0.95
+RESAMPLES, BLOCKS = 2000, 20
+"""Of the bootstrap, and in how many parts it is computed, for memory."""
+
+
+class Scored(NamedTuple):
+    """An image's place and scores."""
+
+    person: str
+    frame: int
+    view: str
+    scores: Row
+
+
+class Mean(NamedTuple):
+    """A mean and its interval of `CONFIDENCE`; count: how many of `over` it is of. low and high are None for one."""
+
+    mean: float
+    low: float | None
+    high: float | None
+    count: int
+    over: str
+
+
+def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
+    """Means of the scores of some images or people; None for what one of them lacks."""
+    listed = list(rows)
+    columns = {name: [row.get(name) for row in listed] for name in listed[0]}
+    known = {name: [value for value in values if value is not None] for name, values in columns.items()}
+    return {name: sum(values) / len(values) if len(values) == len(listed) else None for name, values in known.items()}
+
+
+def known_means(rows: Sequence[Row]) -> Row:
+    """Means of the scores over those that have them, such as images with patches; None for what none has."""
+    known = {name: [value for row in rows if (value := row[name]) is not None] for name in rows[0]}
+    return {name: sum(values) / len(values) if values else None for name, values in known.items()}
+
+
+def grouped(rows: Iterable[tuple[Any, Row]]) -> dict[Any, list[Row]]:
+    """Scores by a key, in the order of first appearance."""
+    groups: dict[Any, list[Row]] = {}
+    for key, row in rows:
+        groups.setdefault(key, []).append(row)
+    return groups
+
+
+def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
+    """Scores by person and frame."""
+    return {key: known_means(images) for key, images in grouped(((r.person, r.frame), r.scores) for r in rows).items()}
+
+
+def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
+    """Scores by person: means over the images of a frame, then over frames."""
+    frames = _frame_means(rows)
+    return {key: known_means(found) for key, found in grouped((who, row) for (who, _), row in frames.items()).items()}
+
+
+def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
+    """The mean of each score with its interval, see the head of this module; None for scores that no image has."""
+    levels = {
+        "people": list(person_means(rows).values()),
+        "frames": list(_frame_means(rows).values()),
+        "images": [row.scores for row in rows],
+    }
+    over = next((over for over, units in levels.items() if len(units) > 1), "images")
+    found: dict[str, Mean | None] = {}
+    for name in rows[0].scores:
+        values = [value for unit in levels[over] if (value := unit[name]) is not None]
+        found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
+    return found
+
+
+def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
+    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None, None) for one value."""
+    if len(values) < 2:
+        return None, None
+    generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
+    drawn = lambda: generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+    means = np.concatenate([numbers[drawn()].mean(axis=1) for _ in range(BLOCKS)])
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
 
 
 # Scores ---------------------------------------------------------------------------------------------------------------

@@ -87,13 +87,13 @@ def candidates_from_matrix(
     return candidates / (2 * jnp.maximum(q_abs, smallest))[..., None], q_abs
 
 
-def from_matrix(m: Float[Array, "*b 3 3"], smallest: float = 0.1) -> Float[Array, "*b 4"]:
+def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     """Quaternion of a rotation matrix, by the best conditioned of the four candidates (see `candidates_from_matrix`).
 
     A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published network ("rotation"
     skinning).
     """
-    candidates, q_abs = candidates_from_matrix(m, smallest)
+    candidates, q_abs = candidates_from_matrix(m)
     best = jnp.argmax(q_abs, axis=-1)[..., None, None]
     return jnp.take_along_axis(candidates, best, axis=-2)[..., 0, :]
 

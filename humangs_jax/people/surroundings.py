@@ -32,7 +32,7 @@ FRAME = 0.98
 """Share of the half frame that the person may reach; a camera that is too near for it steps back."""
 POINT_STEP = 4096
 """Points are padded to a multiple of this: few shapes are compiled."""
-CAMERA_NUMBERS = 5
+JITTER, CAMERA_NUMBERS = 0.3, 5
 UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
 Number = Float[Array, ""] | float
@@ -44,10 +44,10 @@ def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
-def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -> Angles:
-    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `jitter` of the spacing."""
+def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
+    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of the spacing."""
     spacing = 2 * np.pi / count
-    return rng.uniform(0, spacing) + spacing * (np.arange(count) + rng.uniform(-jitter, jitter, count))
+    return rng.uniform(0, spacing) + spacing * (np.arange(count) + rng.uniform(-JITTER, JITTER, count))
 
 
 def cameras_around(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:

@@ -82,9 +82,9 @@ def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Fl
     return factors
 
 
-def covariances(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
+def covariances(gaussians: Gaussians) -> Float[Array, "g 3 3"]:
     """World-space covariance matrices, metres^2."""
-    factors = covariance_factors(gaussians, normalize_quats)
+    factors = covariance_factors(gaussians)
     return jnp.einsum("gik,gjk->gij", factors, factors, precision=transform.EXACT)
 
 

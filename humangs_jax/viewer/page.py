@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar, light_values
+from humangs_jax.avatar.export.gaussians import unit_quats
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
@@ -172,8 +173,6 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
     )
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    quats = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
     logs = np.log(np.maximum(scales, SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
@@ -181,7 +180,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
     if g.harmonics is not None:
         harmonics = np.asarray(g.harmonics, np.float64)
         header["harmonics"], arrays["harmonics"] = _quantized(harmonics, harmonics.min(), harmonics.max())
-    arrays["quats"] = np.rint(quats * 32767).astype("<i2")
+    arrays["quats"] = np.rint(unit_quats(quats) * 32767).astype("<i2")
     arrays["opacities"] = np.rint(opacities * STEPS).astype("<u2")
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
     arrays["weights"], arrays["weight_joints"] = weights.astype("<u2"), joints.astype("u1")

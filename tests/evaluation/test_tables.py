@@ -6,18 +6,8 @@ import io
 import numpy as np
 import pytest
 
-from humangs_jax.evaluation.tables import (
-    Mean,
-    Scored,
-    bootstrap,
-    csv_text,
-    latex_table,
-    markdown_table,
-    mean_scores,
-    overall_means,
-    person_means,
-    shown_mean,
-)
+from humangs_jax.evaluation.run import csv_text, latex_table, markdown_table, shown_mean
+from humangs_jax.evaluation.scores import Mean, Scored, bootstrap, mean_scores, overall_means, person_means
 
 ROWS = [
     Scored("a", 0, "x", {"psnr": 10.0, "patch_psnr": None}),

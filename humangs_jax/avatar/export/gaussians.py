@@ -121,7 +121,7 @@ def plain_arrays(
     harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
     arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
     means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)
-    return means, _unit(quats), scales, opacities, colors, harmonics
+    return means, unit_quats(quats), scales, opacities, colors, harmonics
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
@@ -216,7 +216,7 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]]) -> Gaussians:
     for field, shape, (name, array) in zip(fields, shapes, arrays.items(), strict=False):
         check_array(name, array, (count, *shape), *ranges.get(field, (-LARGEST, LARGEST)))
     values = dict(zip(fields, arrays.values(), strict=False))
-    values["quats"] = _unit(values["quats"])
+    values["quats"] = unit_quats(values["quats"])
     return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()})
 
 
@@ -234,7 +234,8 @@ def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"
     return 0.5 + SH_C0 * coefficients
 
 
-def _unit(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
+def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
+    """Of length 1; the identity where they have no length."""
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
 

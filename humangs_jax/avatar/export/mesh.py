@@ -11,7 +11,6 @@ body. The atlas is our own (`rendering.mesh.atlas`), for any body.
 """
 
 import dataclasses
-import io
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import png_bytes, write_png
 from humangs_jax.io.mesh import INDICES, VERTICES, GlbWriter
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
@@ -180,7 +179,7 @@ def write_mesh_glb(
         ],
         "textures": [{"source": 0, "sampler": 0}],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
-        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": writer.bytes_(_png(mesh.texture))}],
+        "images": [{"name": "skin", "mimeType": "image/png", "bufferView": writer.bytes_(png_bytes(mesh.texture / 255))}],
     }
     if motion is not None:
         document["animations"] = [_animation(writer, avatar, motion, name)]
@@ -253,14 +252,6 @@ def _continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]
     jumps = (quats[1:] * quats[:-1]).sum(axis=-1, keepdims=True) < 0
     signs = np.concatenate([np.ones_like(jumps[:1], float), np.where(jumps, -1.0, 1.0)])
     return quats * np.cumprod(signs, axis=0)
-
-
-def _png(texture: UInt8[np.ndarray, "t t c"]) -> bytes:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(texture).save(stream, format="PNG")
-    return stream.getvalue()
 
 
 # OBJ ------------------------------------------------------------------------------------------------------------------
