@@ -90,19 +90,6 @@ def test_pixels_outside_the_masks_are_seen_by_no_vertex(body, network):
 
 
 @pytest.mark.slow
-def test_vmap_over_subjects_is_a_loop(body, network):
-    variables, config = network
-    subjects = [subject_views(seed) for seed in range(2)]
-    batch = jax.tree.map(lambda *x: jnp.stack(x), *subjects)
-    run = jax.jit(reconstruct_views, static_argnames="config")
-    batched = jax.jit(jax.vmap(lambda v: reconstruct_views(variables, config, body, v)))(batch)
-    for i, subject in enumerate(subjects):
-        alone = run(variables, config, body, subject)
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], batched)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), one, alone)
-
-
-@pytest.mark.slow
 def test_reconstruct_and_render_lower_for_every_platform(body, network):
     variables, config = network
 

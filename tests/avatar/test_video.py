@@ -75,17 +75,6 @@ def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["frame_00000.png", "frame_00001.png", "notes.txt"]
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
-def test_an_interruption_leaves_nothing(tmp_path, name):
-    def drawn():
-        yield from moving_square(5)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / name, drawn(), 24)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path, monkeypatch):
     (tmp_path / "a.mp4").mkdir()
     (tmp_path / "frames").write_text("mine")

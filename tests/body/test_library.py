@@ -143,11 +143,6 @@ def _face_front(body):
     return np.where(np.asarray(body.skinning_weights)[:, 15] > 0.9, np.asarray(body.template)[:, 2], -1)
 
 
-def test_zero_pose_is_the_template(body):
-    found = posed(body)
-    assert np.allclose(found.vertices, body.template, atol=1e-6)
-
-
 def test_own_files_keep_a_body(tmp_path):
     body = made_up_body(1, pose_directions=False, dtype=np.float32)
     body = replace(

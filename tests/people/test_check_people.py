@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from experiments import generator as check_people
-from experiments.generator import people_sheets
-from experiments.harness import call
 from humangs_jax.people import surroundings
 from humangs_jax.people.subject import DEMO, make_subject
 from humangs_jax.people.writer import sample_pose
@@ -57,18 +55,3 @@ def test_holes_in_cloth_are_counted(body, posed, camera):
     torn = dataclasses.replace(subject, surface=surface, face_materials=subject.face_materials[~front])
     _, shares = faults(body, dataclasses.replace(posed, subject=torn), camera)
     assert shares["hollow"] + shares["gaps"] > 0.02
-
-
-@pytest.mark.slow
-def test_a_sheet_is_drawn_twice_alike(tmp_path):
-    import imageio.v3 as iio
-
-    files = []
-    for name in ("one", "two"):
-        out = tmp_path / name
-        sizes = ["--subjects", "1", "--scale", "0.3", "--suffix", ".png", "--sheets", "front_back"]
-        assert call(people_sheets, ["--out", str(out), *sizes]) == 0
-        files.append(out / "people_front_back.png")
-    assert files[0].read_bytes() == files[1].read_bytes()
-    picture = iio.imread(files[0])
-    assert picture.ndim == 3 and (picture != 255).any(-1).mean() > 0.03

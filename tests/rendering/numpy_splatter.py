@@ -12,7 +12,7 @@ NEAR, EPS2D, ALPHA_MIN, ALPHA_MAX, STOP, LARGEST = 0.01, 0.3, 1 / 255, 0.999, 1e
 
 
 def splat(means, quats, scales, opacities, colors, K, cam_from_world, background, width, height):
-    """(rgb (h, w, 3), alpha (h, w), depth (h, w)) of g Gaussians, and every decision: what is drawn where, in which order.
+    """(rgb (h, w, 3), alpha (h, w)) of g Gaussians.
 
     All arguments in float64; quats wxyz of any norm.
     """
@@ -34,15 +34,13 @@ def splat(means, quats, scales, opacities, colors, K, cam_from_world, background
     alpha = np.where(drawn[:, None] & (raw >= ALPHA_MIN), np.minimum(raw, ALPHA_MAX), 0.0)
 
     order = np.argsort(Z, kind="stable")
-    alpha, colors, Z = alpha[order], colors[order], Z[order]
+    alpha, colors = alpha[order], colors[order]
     after = np.cumprod(1 - alpha, axis=0)
     before = np.concatenate([np.ones((1, alpha.shape[1])), after])[:-1]
     weights = np.where(after > STOP, alpha * before, 0.0)
     opacity = weights.sum(0)
     rgb = weights.T @ colors + (1 - opacity)[:, None] * background
-    depth = np.where(opacity > 0, weights.T @ Z / np.where(opacity > 0, opacity, 1), 0.0)
-    images = rgb.reshape(height, width, 3), opacity.reshape(height, width), depth.reshape(height, width)
-    return images, (order, alpha > 0, alpha == ALPHA_MAX, weights > 0)
+    return rgb.reshape(height, width, 3), opacity.reshape(height, width)
 
 
 def rotations(quats):
