@@ -19,7 +19,7 @@ from experiments.results import markdown_table, write_json
 from experiments.subjects import TASKS, People, file_digest, make_evaluation_subject, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import tile
-from humangs_jax.data.usable_views import MASK_THRESHOLD
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.io.images import write_png

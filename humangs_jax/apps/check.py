@@ -27,11 +27,10 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_bo
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD, displacement
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.displacement import displacement
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform

@@ -26,7 +26,7 @@ from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, seen_per
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
-from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colors, match_people
+from humangs_jax.fitting.triangulation import Match, Seen, in_order_of_time, match_colors, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png

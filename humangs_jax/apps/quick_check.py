@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.body_and_masks import points_in_image, surface_points
 from humangs_jax.data.calibration.calibration import (
     CAM_FROM_WORLD_OPENGL,
     CONVENTIONS,
@@ -22,7 +23,6 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
-from humangs_jax.data.usable_views import points_in_image, surface_points
 
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""

@@ -40,8 +40,8 @@ from humangs_jax.core.configuration import (
 )
 from humangs_jax.core.processes import peak_memory
 from humangs_jax.core.progress import bar
+from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import select_views
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json

@@ -13,6 +13,7 @@ import numpy as np
 
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import Float, PyTree
+from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.calibration.photos import SUFFIXES, is_photo, is_transparent
 from humangs_jax.data.calibration.videos import (
     LONGER_SIDE,
@@ -28,7 +29,6 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
-from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score

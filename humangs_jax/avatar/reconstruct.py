@@ -18,8 +18,8 @@ from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transfor
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.displacement import displacement
 from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import (
     SubjectViews,

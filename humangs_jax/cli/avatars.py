@@ -255,8 +255,8 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
 def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     """The views of a capture that show the person, after warnings about what looks wrong in them. Raises: ValueError for none."""
     with stage("reading the capture"):
+        from humangs_jax.data.body_and_masks import usable_views
         from humangs_jax.data.capture import load_capture
-        from humangs_jax.data.usable_views import usable_views
 
         photos = load_capture(path, fit_masks=fit_masks)
     nobody = None

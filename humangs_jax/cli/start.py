@@ -277,7 +277,7 @@ class Start:
     def _reconstruct(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
-            from humangs_jax.data.usable_views import usable_views
+            from humangs_jax.data.body_and_masks import usable_views
             from humangs_jax.network.weights import load_weights
             from humangs_jax.viewer.page import write_page
 

@@ -14,8 +14,8 @@ from jax import lax
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.data.body_and_masks import unusable_views, usable_views
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.usable_views import unusable_views, usable_views
 from humangs_jax.data.views import standardize
 from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals

@@ -15,10 +15,10 @@ from humangs_jax.body.resolution import decimate, split_long_edges, vertex_areas
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD, usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.motion.rules import nearest_axis, standing_axis, turned_upright, upright_matrix
-from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
@@ -45,7 +45,7 @@ class SubjectViews:
     rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
     views, those after them are padding (see `pad_views`); None: all are. depths: (v, h, w) mean z of the person in a pixel,
     metres, where the mask is not 0; 0: unknown there. None: unknown everywhere. displacement: (n, 3) of the vertices of the
-    shaped body in the T-pose, metres (`data.displacement`); None: none.
+    shaped body in the T-pose, metres (`data.body_and_masks`); None: none.
     """
 
     images: Float[Array, "v h w 3"]

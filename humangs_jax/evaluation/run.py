@@ -24,11 +24,11 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.progress import bar, printable
+from humangs_jax.data.body_and_masks import empty_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
-from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
 from humangs_jax.evaluation.scores import (
     CONFIDENCE,

@@ -75,7 +75,7 @@ class Runtime:
         gain="boundaries and hems of bodies that are a centimetre off",
         measured="benchmarks/quality.md",
     )
-    """The body is moved to the edges of the masks first (`data.displacement`), for weights that look at the pixels of the
+    """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that look at the pixels of the
     "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""

@@ -8,9 +8,9 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
+from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews, upright
 from humangs_jax.geometry.camera import Camera
 

@@ -14,8 +14,8 @@ from humangs_jax.apps.check import BOUNDARY, ViewCheck, check_capture, draw_body
 from humangs_jax.apps.quick_check import likely_mistakes
 from humangs_jax.body.model import BodyModel, person_vertices, rest_pose
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import surface_points
 from humangs_jax.data.capture import capture_from_arrays, load_capture
-from humangs_jax.data.usable_views import surface_points
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import read_image
 

@@ -12,8 +12,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import HELD_JOINTS, INWARDS, OUTWARDS, WRAP, displacement
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.displacement import HELD_JOINTS, INWARDS, OUTWARDS, WRAP, displacement
 from humangs_jax.data.views import subject_rest
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals

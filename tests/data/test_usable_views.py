@@ -15,9 +15,9 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import views as module
+from humangs_jax.data.body_and_masks import _sampling, unusable_views, usable_views
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, exposures, gains_of, multiplied, with_gains
-from humangs_jax.data.usable_views import _sampling, unusable_views, usable_views
 from humangs_jax.data.views import greedy_cover, select_views, standardize
 from humangs_jax.refinement.photos import crop_to_person
 
@@ -75,7 +75,7 @@ def test_other_masks_are_kept(demo, mask):
 
 
 def test_exact_masks_hold_the_body(demo, monkeypatch):
-    monkeypatch.setattr("humangs_jax.data.usable_views.LEAST_SHARE", 0.95)
+    monkeypatch.setattr("humangs_jax.data.body_and_masks.LEAST_SHARE", 0.95)
     assert not unusable_views(demo)
 
 

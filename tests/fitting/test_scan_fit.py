@@ -35,8 +35,7 @@ from humangs_jax.fitting.scan_files import (
     render_scan_views,
     sample_scan,
 )
-from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
-from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts, start_state
+from humangs_jax.fitting.scan_fit import ScanFitConfig, Start, body_in_scan, facing_back, fit_scan, search_starts, start_state
 from humangs_jax.fitting.state import pose_prior
 from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import project

@@ -19,14 +19,17 @@ from humangs_jax.fitting.landmark_fit import FitConfig
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
 from humangs_jax.fitting.swaps import find_exchanged_hands, find_mirrored, find_swaps
 from humangs_jax.fitting.triangulation import (
+    Match,
+    Seen,
     Similarity,
     align_points,
     align_robustly,
+    in_order_of_time,
+    match_people,
     reprojection_errors,
     triangulate,
     triangulate_robustly,
 )
-from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres

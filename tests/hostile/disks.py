@@ -17,6 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 import writers
+from kills import run_undisturbed
 from writers import COMMANDS, Command
 
 SIZE = 256 << 20
@@ -80,15 +81,8 @@ def targets(expected: dict) -> list[str]:
 
 def begun(command: Command, folder: Path, inputs: Path):
     """A place as it is before the run that is looked at; its state then and after an undisturbed run; bytes of the latter."""
-    place = writers.place_of(command, folder, inputs, "place")
-    if command.first is not None:
-        assert writers.run(command, place, inputs, 1).code == 0, command.name
-    kept = folder / "kept"
-    shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(place, kept)
-    before = writers.snapshot(place)[0]
-    assert writers.run(command, place, inputs, 2).code == 0, command.name
-    expected = writers.snapshot(place)[0]
+    place, kept = writers.place_of(command, folder, inputs, "place"), folder / "kept"
+    before, _, expected = run_undisturbed(command, place, kept, inputs)
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
     shutil.rmtree(place)
     shutil.move(kept, place)

@@ -16,6 +16,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
     CalibratedCamera,
@@ -43,7 +44,6 @@ from humangs_jax.data.calibration.photos import (
 from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, few
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
-from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading

@@ -13,10 +13,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, few
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
 from humangs_jax.io.reading import inside, reading
 

@@ -450,13 +450,9 @@ def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> Calibrat
     if np.abs(R @ R.T - np.eye(3)).max() > 5e-3 or np.linalg.det(R) < 0:
         raise CaptureError(notes.path, f"{at}/RT", "the rotation is singular, mirrored or scaled")
     lens = brown_conrady(notes.array(f"{at}/D").reshape(-1), notes.path, f"{at}/D")
-    width = height = None
+    size = (1, 1)
     if first is not None:
-        width, height = _size(photos, first)
-    return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), width or 1, height or 1, lens)
-
-
-def _size(photos: Smc, key: str) -> tuple[int, int]:
-    data = photos.array(key, "image_bytes")
-    with reading(f"{photos.path}: {key}", "image", CaptureError), image_in(data.astype(np.uint8).tobytes()) as image:
-        return image.size
+        data = photos.array(first, "image_bytes")
+        with reading(f"{photos.path}: {first}", "image", CaptureError), image_in(data.astype(np.uint8).tobytes()) as image:
+            size = image.size
+    return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), size[0], size[1], lens)

@@ -11,6 +11,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import UInt8
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import DEFAULT_BODY, load_capture, read_parameters
 from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
 from humangs_jax.data.loading.examples import (
@@ -24,7 +25,6 @@ from humangs_jax.data.loading.examples import (
     view_generator,
 )
 from humangs_jax.data.photos import check_photos, read_checked, read_description, read_frames_and_matrices
-from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import check_image, to_uint8
 
 logger = logging.getLogger("humangs_jax.data.loading")
