@@ -205,7 +205,7 @@ def appearance_section(numbers: dict[str, Any], start: Any) -> str:
 def forward_pass(
     run: Run, people: People = People(8, held_out=6, poses=0, split="validation"), runs: tuple[str, ...] = ()
 ) -> None:
-    """What other networks gain: the shipped one changed by hand, and others, before and after the learned iterations.
+    """What other networks gain: the one of --weights with changed logits, and others, before and after the learned iterations.
 
     Needs the extra `lpips`.
 
@@ -214,7 +214,7 @@ def forward_pass(
     """
     start = people.start()
     networks = {"alex": load_lpips("alex")}
-    rows: dict[str, tuple[Any, Any]] = {"shipped": (start.variables, start.config)}
+    rows: dict[str, tuple[Any, Any]] = {"as it is": (start.variables, start.config)}
     rows |= {name: (changed(start.variables, *change), start.config) for name, change in DECODERS.items()}
     for name, _, file in (text.partition("=") for text in runs):
         variables, config = load_weights(Path(file))
