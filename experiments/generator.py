@@ -4,7 +4,6 @@ import functools
 from pathlib import Path
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
@@ -13,14 +12,11 @@ from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
-from humangs_jax.body.resolution import decimate
-from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.people import anatomy, surroundings
-from humangs_jax.people.anatomy import Rotations
 from humangs_jax.people.subject import DEMO, describe, make_subject, padded, pose_subject, render_view
 from humangs_jax.people.writer import sample_motion, sample_pose
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
@@ -38,7 +34,7 @@ DEEP = 0.01
 
 
 @entry
-def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0, worst: int = 0) -> None:
+def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0) -> None:
     """Faults of synthetic people: counted in images of random poses from random cameras, as shares of the person's pixels.
 
     Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in
@@ -48,13 +44,10 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0
     subjects: people that are built, posed and rendered
     size: side of the pictures
     first: first seed (training people by default)
-    worst: how many of the seeds with most faults are printed
     """
     body = load_body()
     cases = {str(first + i): functools.partial(look_at, body, first + i, size) for i in range(subjects)}
     rows = run.rows(cases, {"size": size})
-    for name in ("poking", "hollow", "gaps") if worst else ():
-        print(name, [(seed, f"{rows[seed][name]:.2%}") for seed in sorted(rows, key=lambda s: -rows[s][name])[:worst]])
     numbers, table, pixels = {}, [], np.asarray([row["pixels"] for row in rows.values()])
     for name, definition in FAULTS.items():
         each = np.asarray([row[name] for row in rows.values()])
@@ -136,50 +129,6 @@ def _faces_the_eye(vertices, faces, eye):
 
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
-
-
-# Self-penetration ----------------------------------------------------------------------------------------------------
-
-OUTSIDE = 2e-3
-"""Metres along the normal at which a vertex asks."""
-INSIDE = 0.6
-"""Winding number above which a point is inside: meshes are not quite closed (mouth, eyes)."""
-AT_ONCE = 64
-
-
-def winding_numbers(points: Float[Array, "q 3"], vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, " q"]:
-    """How often the mesh winds around each point (q, 3): sum of the signed solid angles of its faces over 4 pi."""
-    corners = vertices[faces]
-    dot = lambda x, y: jnp.sum(x * y, axis=-1)
-
-    def one(point):
-        a, b, c = (corners[:, i] - point for i in range(3))
-        la, lb, lc = (jnp.linalg.norm(x, axis=-1) for x in (a, b, c))
-        below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-        return jnp.sum(2 * jnp.arctan2(dot(a, jnp.cross(b, c)), below)) / (4 * jnp.pi)
-
-    return jax.lax.map(one, points, batch_size=AT_ONCE)
-
-
-class OverlapMeter:
-    """Asks the vertices of a body, decimated to `count`; those that are inside in T-pose already do not count."""
-
-    def __init__(self, body: BodyModel, count: int = 1600):
-        self.body = decimate(body, count)
-        self.rest = shape_body(self.body, jnp.zeros(0))
-        self.at_rest = np.zeros(len(self.body.template), bool)
-        self.at_rest = self.inside(np.zeros((len(body.parents), 3)))
-
-    def inside(self, rotations: Rotations) -> Bool[np.ndarray, " n"]:
-        """The vertices (n,) that a pose of rotation vectors (j, 3) puts inside another part of the body."""
-        return np.asarray(_inside(self.body, self.rest, jnp.asarray(rotations, jnp.float32))) & ~self.at_rest
-
-
-@jax.jit
-def _inside(body, rest, rotations):
-    vertices = pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices
-    points = vertices + OUTSIDE * vertex_normals(vertices, body.faces)
-    return winding_numbers(points, vertices, body.faces) > INSIDE
 
 
 # Contact sheets ------------------------------------------------------------------------------------------------------
