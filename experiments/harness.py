@@ -140,9 +140,12 @@ class _Tuple(argparse.Action):
 
 
 def _helps(documented) -> dict[str, str]:
-    _, _, text = (inspect.getdoc(documented) or "").partition("Options:")
-    found = re.findall(r"^ *(\w+): (.*(?:\n(?! *\w+: ).+)*)", text, re.MULTILINE)
-    return {name: " ".join(line.split()).replace("%", "%%") for name, line in found}
+    """Option -> its line; of a class also those of its bases."""
+    found = {}
+    for one in reversed(getattr(documented, "__mro__", (documented,))):
+        _, _, text = (inspect.getdoc(one) or "").partition("Options:")
+        found |= re.findall(r"^ *(\w+): (.*(?:\n(?! *\w+: ).+)*)", text, re.MULTILINE)
+    return {name: " ".join(line.split()).replace("%", "%%") for name, line in found.items()}
 
 
 @dataclasses.dataclass(eq=False)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.harness import Run, entry, figure
-from experiments.paper.bench import PHOTOS, REFERENCE, VIEW_COUNTS, shown, takes_one, variants
+from experiments.paper.bench import COUNTS, PHOTOS, REFERENCE, shown, takes_one, variants
 from experiments.paper.rows import SHIPPED, Tested, load_networks, measured, trained, views_of
 from experiments.results import markdown_table
 from humangs_jax.avatar.frames import draw
@@ -22,7 +22,6 @@ from humangs_jax.evaluation.cases import find_people, weights_method
 from humangs_jax.io.images import write_png
 from humangs_jax.losses.perceptual import lpips
 
-TOKENS = (REFERENCE, "no global token")
 DEPTHS = ("one depth", REFERENCE)
 PATCHES = 8
 """Patches along a side of an image: 64 of 512 pixels."""
@@ -45,10 +44,10 @@ def paper_figures(
 ) -> None:
     """The paper's figures, of trained variants.
 
-    varying: PSNR of novel poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; token: PSNR
-    with and without the global token over photos; features: histogram of what the features of four depths change in a patch of
-    64 x 64 pixels of 512 more than half of which is the person (LPIPS where patches are large enough); driven:
-    people in the poses of other people; systems: the first person by every system of the bench that is trained.
+    varying: PSNR of novel poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many; features:
+    histogram of what the features of four depths change in a patch of 64 x 64 pixels of 512 more than half of which is the person
+    (LPIPS where patches are large enough); driven: people in the poses of other people; systems: the first person by every system
+    of the bench that is trained.
 
     Options:
     out: folder of the images
@@ -67,29 +66,13 @@ def paper_figures(
 
 def text_of(numbers: Mapping[str, Any]) -> str:
     """The curves over photos as a table, and what the histogram says."""
-    counts = [str(count) for count in VIEW_COUNTS]
-    rows = [
-        [
-            name,
-            kind,
-            *(f"{x:.2f}" if (x := {str(k): v for k, v in points.items()}.get(count)) else "" for count in counts),
-        ]
-        for figure, kind in (("token", "one pose, that of the target"), ("varying", "several poses, another one"))
-        for name, points in numbers.get(figure, {}).items()
-    ]
-    texts = [markdown_table(["PSNR, dB, by photos", "photos show", *counts], rows, "ll" + "r" * len(counts))]
+    cell = lambda points, count: f"{points[int(count)]:.2f}" if int(count) in points else ""
+    rows = [[name, *(cell(points, x) for x in COUNTS)] for name, points in numbers.get("varying", {}).items()]
+    texts = [markdown_table(["PSNR, dB, of another pose, by photos of several", *COUNTS], rows)] if rows else []
     if found := numbers.get("features"):
         said = f"mean {found['mean']:.1e}, skewness {found['skewness']:+.2f}"
         texts.append(f"Without - with features of four depths, {found['kind']}, {found['patches']} patches: {said}.")
     return "\n\n".join(texts)
-
-
-def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> bool:
-    """Whether all of these are trained; says which one is not."""
-    missing = [name for name in names if name not in systems]
-    if missing:
-        print(f"{figure}: {missing[0]!r} is not trained", file=sys.stderr)
-    return not missing
 
 
 def varying(systems: dict[str, Any], networks: Any, options: Any) -> dict[str, dict[int, float]]:
@@ -97,36 +80,24 @@ def varying(systems: dict[str, Any], networks: Any, options: Any) -> dict[str, d
     people = options.varying or options.data
     curves: dict[str, dict[int, float]] = {}
     for name in systems:
-        for count in (1, 2, 4, 6):
+        for count in map(int, COUNTS):
             found = measured(
                 systems[name], people, count, options.body, networks, views_of(people, count, options.body, varying=True)
             )
             if found is not None and (scores := found["animation"] or found["reconstruction"]):
                 curves.setdefault(name, {})[count] = scores["psnr"]
-    draw_curves(curves, options.out / "varying.png", "photos of varying poses")
-    return curves
-
-
-def token(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, dict[int, float]]:
-    """With and without the global token."""
-    curves: dict[str, dict[int, float]] = {}
-    if present(systems, TOKENS, "token"):
-        for name in TOKENS:
-            for count in VIEW_COUNTS:
-                try:
-                    found = measured(systems[name], arguments.data, count, arguments.body, networks)
-                except ValueError as error:  # not as many photos that are evenly spaced
-                    print(f"token: {error}", file=sys.stderr)
-                    continue
-                if found is not None and found["reconstruction"] is not None:
-                    curves.setdefault(name, {})[count] = found["reconstruction"]["psnr"]
-        draw_curves(curves, arguments.out / "token.png", "photos")
+    with figure(options.out / "varying.png", size=(5, 3.4)) as axes:
+        for name, points in curves.items():
+            axes.plot(list(points), list(points.values()), "o-", label=name)
+        axes.set(xlabel="photos of varying poses", ylabel="PSNR, dB")
+        axes.legend(fontsize=8)
     return curves
 
 
 def features(systems: dict[str, Any], networks: Any, arguments: Any) -> dict[str, Any]:
     """What the features of four depths change, by patches."""
-    if not present(systems, DEPTHS, "features"):
+    if missing := [name for name in DEPTHS if name not in systems]:
+        print(f"features: {missing[0]!r} is not trained", file=sys.stderr)
         return {}
     people, changes, kind = find_people(arguments.data, PHOTOS, None, arguments.body), [], "squared error"
     methods = [weights_method(*systems[name]) for name in DEPTHS]
@@ -219,18 +190,8 @@ def systems_shown(systems: dict[str, Any], networks: Any, arguments: Any) -> dic
     return {"systems": names}
 
 
-def draw_curves(curves: dict[str, dict[int, float]], path: Path, label: str) -> None:
-    """PSNR over numbers of photos."""
-    with figure(path, size=(5, 3.4)) as axes:
-        for name, points in curves.items():
-            axes.plot(list(points), list(points.values()), "o-", label=name)
-        axes.set(xlabel=label, ylabel="PSNR, dB")
-        axes.legend(fontsize=8)
-
-
 FIGURES: dict[str, Callable[[dict[str, Any], Any, Any], Any]] = {
     "varying": varying,
-    "token": token,
     "features": features,
     "driven": driven,
     "systems": systems_shown,

