@@ -7,8 +7,8 @@ views of the same unseen people.
 A run goes in rounds of `ROUND` steps with the squared error and the tightness of the paper, each with a learning rate that ends
 at 0, until it is `MARGIN` above the vertex-color baseline in the foreground of the validation people; or above it, and a round
 has gained less than `FLAT`; or `MOST_ROUNDS` are done, and it is not trained. Then comes a quarter of a round with the perceptual
-loss, too. So all that learn fast have the same number of steps. People are plain (`people.py`): on richer ones the systems that
-attend to photos show grey bodies after as many steps.
+loss, too: what falls below the vertex colors there is not trained either. So all that learn fast have the same number of steps.
+People are plain (`people.py`): on richer ones the systems that attend to photos show grey bodies after as many steps.
 """
 
 import dataclasses
@@ -26,10 +26,9 @@ from scipy.stats import t as student
 from experiments.costs import costs_of
 from experiments.paper.people import on_disk
 from experiments.results import REPOSITORY, write_json
-from experiments.systems import BENCH_WIDTH, SYSTEMS
+from experiments.systems import ADDED, BENCH_WIDTH, SYSTEMS
 from experiments.systems import ONE_PHOTO as TAKE_ONE
 from experiments.systems.grouped import GroupReader
-from experiments.systems.pixel_queries import QueryDriver
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.data.loading import ViewSampling
@@ -59,7 +58,6 @@ SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim"
 TASKS = {"reconstruction": "pose of the photos", "animation": "another pose"}
 PHOTOS = 4
 """That a network is trained with, unless it takes one."""
-VIEW_COUNTS = (1, 2, 4, 6, 8)
 COUNTS = ("1", "2", "4", "6")
 NEAR = tuple(f"near {count}" for count in COUNTS)
 REFERENCE = "paper"
@@ -137,7 +135,7 @@ def tests_of(name: str, variant: Variant) -> tuple[str, ...]:
     """What a variant is scored with: numbers of photos, "near" those of nearer cameras; several only where claims need them."""
     if variant.photos == 1:
         return ("1",)
-    several = name in (REFERENCE, "no global token", *SYSTEMS)
+    several = name in (REFERENCE, "no global token", *SYSTEMS) and name not in ADDED
     near = NEAR if name in ("lvsm", "humanram", "ghg", REFERENCE, "no global token", "1 Gaussian a vertex") else ()
     return *(COUNTS if several else (str(PHOTOS),)), *near
 
@@ -299,8 +297,11 @@ def headline(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_trained(row: Mapping[str, Any], painted: float) -> bool:
-    """Whether a run is done and meets the criterion. painted: foreground PSNR of the vertex-color baseline, dB."""
-    return row["done"] and meets(row["curve"], painted)
+    """Whether a run is done, meets the criterion, and is above the vertex colors after its perceptual steps, too.
+
+    painted: foreground PSNR of the vertex-color baseline, dB.
+    """
+    return row["done"] and meets(row["curve"], painted) and row["validation"] > painted
 
 
 def state_of(report: Mapping[str, Any], name: str) -> str:
@@ -353,6 +354,5 @@ def takes_one(config: Any) -> bool:
 
 
 def animatable(config: Any) -> bool:
-    """Whether a system can show a pose that no photo shows: LVSM knows no body."""
-    driver = config.architecture.driver
-    return not (isinstance(driver, QueryDriver) and driver.texture is None)
+    """Whether a system can show a pose that no photo shows."""
+    return getattr(config.architecture.driver, "moves", True)

@@ -1,5 +1,6 @@
 """Trains the variants of the bench one after the other, and scores them."""
 
+import itertools
 import os
 import signal
 import sys
@@ -23,6 +24,7 @@ from experiments.paper.bench import (
     ROUND,
     SCORES,
     SEEDS,
+    TASKS,
     Difference,
     animatable,
     difference,
@@ -42,6 +44,7 @@ from experiments.paper.bench import (
 )
 from experiments.paper.people import SIZE, write_plain
 from experiments.results import markdown_table, write_json
+from experiments.systems import ADDED
 from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.io.reading import read_json
 from humangs_jax.network.weights import load_weights
@@ -113,12 +116,13 @@ def paper(
 
 
 def queue(seeds: int) -> list[tuple[str, int]]:
-    """Runs, the most wanted ones first: of systems a seed before a second one of any."""
+    """Runs, the most wanted ones first: of systems a seed before a second one of any; what was added later is last."""
     systems = [name for name, variant in variants().items() if not variant.about]
     others = [name for name, variant in variants().items() if variant.about]
     more = [(REFERENCE, seed) for seed in range(1, seeds)]
     order = [(name, 0) for name in systems] + more + [(name, 0) for name in others]
-    return order + [x for seed in range(1, seeds) for name in (*systems, *others) if (x := (name, seed)) not in more]
+    order += [x for seed in range(1, seeds) for name in (*systems, *others) if (x := (name, seed)) not in more]
+    return sorted(order, key=lambda run: run[0] in ADDED)
 
 
 def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
@@ -186,15 +190,15 @@ def table(report: Mapping[str, Any]) -> str:
     settings = report["settings"]
     said = (
         f"{settings['test_people']} test people; rounds of {settings['round_steps']} steps, a last quarter of one with the "
-        "perceptual loss. "
-        f"Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on the validation people, or "
-        f'where a run is flat; "{NOT_TRAINED}": it has not got there. Intervals: 95 %, over people and seeds.'
+        f"perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on the "
+        f'validation people, or where a run is flat; "{NOT_TRAINED}": it has not got there, or the perceptual loss has taken it '
+        "below the baseline. Intervals: 95 %, over people and seeds."
     )
     texts = [markdown_table(header, lines), said]
     if counted:
         texts.append(markdown_table(["foreground PSNR, dB, by photos", "cameras", *COUNTS], counted, "llrrrr"))
-    if parts := ablations(report):
-        texts += ["The paper's ablations, PSNR in dB and LPIPS (a gain is positive):", markdown_table(*parts)]
+    for part, (heads, rows) in ablations(report).items():
+        texts += [f"{part}; a gain is positive:", markdown_table(heads, rows, "lllrrrr")]
     return "\n\n".join(texts)
 
 
@@ -205,20 +209,31 @@ def differences(report: Mapping[str, Any]) -> dict[str, Difference]:
     return {name: difference(runs, own, (REFERENCE, PHOTOS)) for name, own in with_photos.items() if REFERENCE in ready}
 
 
-def ablations(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]] | None:
-    """Heading and rows: what the global token, four depths, five Gaussians a vertex and each further photo gain."""
-    runs, ready, lines = report["runs"], trained_names(report), []
-    against = {"global token": "no global token", "four depths": "one depth", "1 + 4 Gaussians a vertex": "1 Gaussian a vertex"}
-    for part, other in [*against.items(), ("photos, over the number before", REFERENCE)]:
-        for kind, cameras in ((COUNTS, "standard"), (NEAR, "near")):
-            for score, sign in (("psnr", 1), ("lpips_alex", -1)):
-                cells = []
-                for i, test in enumerate(kind):
-                    base = test if other != REFERENCE else kind[i - 1] if i else None
-                    both = ((REFERENCE, test), (other, base or ""))
-                    known = base and all(name in ready and x in finished(runs, name)[0]["scores"] for name, x in both)
-                    found = difference(runs, *both, score=score) if known else None
-                    cells.append("-" if found is None else found._replace(mean=sign * found.mean).text(2 if sign > 0 else 4))
-                if set(cells) != {"-"}:
-                    lines.append([part, cameras, SCORES[score][0], *cells])
-    return (["", "cameras", "score", *COUNTS], lines) if lines else None
+ABLATIONS = {
+    "The global token": "no global token",
+    "Features of four depths": "one depth",
+    "1 tight + 4 free Gaussians a vertex instead of 1": "1 Gaussian a vertex",
+    "Photos, over the number before": REFERENCE,
+}
+"""The paper's, and the variant without the part; that of photos compares the reference with itself."""
+
+
+def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
+    """Heading and rows of each ablation: what a part gains, by cameras, poses and numbers of photos."""
+    runs, ready, found = report["runs"], trained_names(report), {}
+    scored = lambda name, test, task: name in ready and task in finished(runs, name)[0]["scores"].get(test, {})
+    for part, other in ABLATIONS.items():
+        lines = []
+        for kind, task, score in itertools.product((COUNTS, NEAR), TASKS, ("psnr", "lpips_alex")):
+            sign, digits = (1, 2) if score == "psnr" else (-1, 4)
+            before = kind if other != REFERENCE else ("", *kind)
+            cells = []
+            for a, b in zip(kind, before, strict=False):
+                known = scored(REFERENCE, a, task) and scored(other, b, task)
+                gain = difference(runs, (REFERENCE, a), (other, b), task, score) if known else None
+                cells.append("-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits))
+            if set(cells) != {"-"}:
+                lines.append(["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *cells])
+        if lines:
+            found[part] = (["cameras", "shown", "gain", *COUNTS], lines)
+    return found

@@ -16,6 +16,7 @@ from experiments.systems.cross_attention import CrossAttentionReader
 from experiments.systems.grouped import GroupDecoder, GroupReader
 from experiments.systems.pixel_queries import NoReader, PhotoDecoder, QueryDriver
 from experiments.systems.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
+from experiments.systems.stereo import NearestPairDriver, StereoDecoder
 from experiments.systems.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
 from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.two_stream import TwoStreamReader
@@ -183,6 +184,15 @@ def ghg(size: Size = "published") -> HumanGSConfig:
     return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions if published else _scaled(conventions))
 
 
+def gps(size: Size = "published") -> HumanGSConfig:
+    """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest of the photos. Novel views only."""
+    published = size == "published"
+    decoder = StereoDecoder() if published else StereoDecoder((16, 32, 64), planes=24)
+    conventions = Conventions(image_size=1024, pixels="person")
+    parts = Architecture(PlainPhotos(patch_size=8), NoReader(), decoder, NearestPairDriver())
+    return HumanGSConfig(parts, conventions if published else _scaled(conventions))
+
+
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
     """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as can be."""
     return PatchTransformer(patch_size, "place", TriplaneConfig(2, 1), transformer, upsampler=None)
@@ -204,7 +214,10 @@ SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "lhm_plus": lhm_plus,
     "gst": gst,
     "ghg": ghg,
+    "gps": gps,
 }
 """By name; each is called with a `Size`."""
 ONE_PHOTO = ("lhm", "gst")
 """Systems that refuse a second photo."""
+ADDED = ("gps",)
+"""Systems that came after the bench's queue had begun, and so are its last."""

@@ -5,9 +5,10 @@ of 26 groups of 265 vertices of SMPL) that cross-attend to its tokens; a Gaussia
 offset; the body's pose and shape and the camera come from the same network.
 
 Our reading: the tokens attend to each other before they look at the photo, as in any decoder of a transformer; the body, its pose
-and the camera are given, as they are to every system here, so that nothing is lost by wrong ones; our patch transformer stands
-for HMR2's; vertices are grouped in their order; offsets are in the canonical frame, so that the person can be posed, which theirs
-cannot. Behind the reader a token changes nothing outside of its group.
+and the camera are given, as they are to every system here: theirs come from HMR2's pretrained weights, and a network that knows a
+few hundred people would be judged by its wrong poses alone; our patch transformer stands for HMR2's; vertices are grouped in
+their order; offsets are in the canonical frame, so that the person can be posed, which theirs cannot. Behind the reader a token
+changes nothing outside of its group.
 """
 
 import flax.linen as nn

@@ -60,8 +60,12 @@ class PhotoDecoder(Decoder):
 
     def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """See `parts.Decoder`."""
-        nothing = Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
-        return HumanGSOutputs(nothing, scene=Photos(encoder_pixels(inputs, run), inputs.view_count))
+        return HumanGSOutputs(no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count))
+
+
+def no_gaussians() -> Gaussians:
+    """Of systems that make no canonical ones."""
+    return Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
 
 
 @part
@@ -78,6 +82,11 @@ class QueryDriver(PixelDriver):
     """Of photos and targets."""
     latents: Vertices | None = None
     """Learned tokens of LVSM's encoder-decoder, which has two transformers, None: photos and target attend to each other."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it can show a pose that no photo shows: without the texture the body is unknown."""
+        return self.texture is not None
 
     def __post_init__(self):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""

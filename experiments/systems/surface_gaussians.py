@@ -5,8 +5,9 @@ x 512 texels, the visible views weighted by the softmax of 5 times the cosine at
 and for canonical positions (64 x 1, 2, 4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width
 1024), and decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
 0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: encoders of 3 + 1 channels
-(color, whether seen) and 3 (position), whose scales are joined, and three decoders; no static texture of other frames, which half
-of their steps drop, as the photos of a person are all there is; the pose is that of the target.
+(color, whether seen) and 3 (position), whose scales are joined, and three decoders; no second, static texture of other frames,
+which half of their steps drop: the photos here show one pose, and for a target in another pose theirs is the static texture; the
+pose is that of the target.
 
 Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
 back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of

@@ -5,6 +5,7 @@ with a driver is the one before any correction.
 """
 
 import functools
+from collections.abc import Iterable
 from typing import Any, cast
 
 import flax.linen as nn
@@ -70,22 +71,18 @@ class GaussianDriver(Driver):
 
         posed, offsets = jax.lax.map(one, (targets.rotations, targets.translations))
         flat = lambda x: None if x is None else x.reshape(-1, *x.shape[2:])
-        drawn = draw_posed(posed, targets, backgrounds, config)
-        flattened = drawn._replace(opacities=flat(posed.opacities), tight_offsets=flat(offsets))
-        return flattened._replace(shell_spread=outputs.shell_spread)
+        found = draw_posed(posed, targets, backgrounds, config)._replace(opacities=flat(posed.opacities))
+        return found._replace(tight_offsets=flat(offsets), shell_spread=outputs.shell_spread)
 
     @nn.nowrap
     def show(
         self, variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"]]:
         """See `parts.Driver`. Their world has to be y-up, unlike that of `reconstruct`."""
-        outputs, body, views, config = _reconstructed(variables, config, inputs)
+        outputs, body, views, config = reconstructed(variables, config, inputs)
         own = part_variables(variables, "driver")
         posed = (_posed(self, own, outputs, body, views.betas, pose, config) for pose in _poses(targets))
-        how = SPLAT_PRESETS[config.conventions.rendering]
-        drawn = list(draw_gaussians(posed, targets.cameras, jnp.full(3, background), how))
-        images = np.stack([np.clip(np.asarray(one.rgb), 0, 1) for one in drawn])
-        return images, np.stack([np.asarray(one.alpha) for one in drawn])
+        return drawn(posed, targets.cameras, background, config)
 
 
 class PixelDriver(Driver):
@@ -138,7 +135,7 @@ class PixelDriver(Driver):
         """See `parts.Driver`. Raises: ValueError for another background than white."""
         if background != 1:
             raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
-        outputs, body, views, config = _reconstructed(variables, config, inputs)
+        outputs, body, views, config = reconstructed(variables, config, inputs)
         own, images = part_variables(variables, "driver"), []
         for pose, camera in zip(_poses(targets), targets.cameras, strict=True):
             images.append(np.asarray(_image(self, own, outputs, body, _one_view(views, pose, camera), config)))
@@ -158,9 +155,19 @@ def target_queries(
     return views.posed_vertices, encoder_pixels(views, config.run())[..., 3:]
 
 
-def _reconstructed(
+def drawn(
+    posed: Iterable[Gaussians], cameras: Camera, background: float, config: HumanGSConfig
+) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"]]:
+    """Images and alpha of Gaussians for each camera, as the weights were trained with."""
+    how = SPLAT_PRESETS[config.conventions.rendering]
+    found = list(draw_gaussians(posed, cameras, jnp.full(3, background), how))
+    return np.stack([np.clip(np.asarray(x.rgb), 0, 1) for x in found]), np.stack([np.asarray(x.alpha) for x in found])
+
+
+def reconstructed(
     variables: Variables, config: HumanGSConfig, inputs: Capture
 ) -> tuple[HumanGSOutputs, BodyModel, SubjectViews, HumanGSConfig]:
+    """What the network makes of a capture; the body and photos that it sees, the configuration with buffers that fit."""
     body = gaussian_body(inputs.body, config)
     views = standardize(equal_exposure(inputs), config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)

@@ -2,25 +2,33 @@
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_line import run as run_command
+from safetensors.numpy import save_file
 
 from experiments import made_up
 from experiments.harness import call
 from experiments.paper import bench, claims, cost, figures, people, rows, tables, train_all
+from experiments.training import abstract_batch, random_networks
 from humangs_jax.body.library import load_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.preprocess.run import Settings, preprocess
 from humangs_jax.network.config import paper_parts
+from humangs_jax.network.conversion import to_release
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.network.presets import paper
-from humangs_jax.network.weights import save_weights
-from humangs_jax.training.config import tiny
+from humangs_jax.network.presets import paper, published
+from humangs_jax.network.weights import load_weights
+from humangs_jax.training.config import read_config, tiny
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import seed_numbers, update
 
 PEOPLE = 20
 
@@ -81,6 +89,7 @@ def test_variants_differ_from_the_reference_in_what_they_are_about():
     assert all(bench.configuration(x, 0, 8).loss.squared == 1 for x in queue.values())
     order = train_all.queue(3)
     assert order[0] == ("paper", 0) and len(set(order)) == len(order) == 3 * len(queue)
+    assert {name for name, _ in order[-3:]} == {"gps"} and bench.tests_of("gps", queue["gps"]) == ("4",)
     assert order.index(("paper", 2)) < order.index(("no global token", 0)) < order.index(("lvsm", 1))
     assert bench.tests_of("lhm", queue["lhm"]) == ("1",) and len(bench.tests_of("ghg", queue["ghg"])) == 8
 
@@ -94,6 +103,7 @@ def test_a_run_ends_when_a_round_gains_nothing_and_counts_if_it_beats_the_painte
     assert not bench.is_trained(rising | {"done": False}, 1.0)
     flat = run(1.0, curve=(9.0, 9.1))
     assert bench.is_trained(flat, 9.0) and not bench.is_trained(flat, 20.0)
+    assert not bench.is_trained(flat | {"validation": 8.9}, 9.0)  # lost with the perceptual loss
 
 
 def test_an_interval_covers_people_and_seeds(report):
@@ -147,11 +157,17 @@ def test_the_table_marks_what_is_not_trained(report):
     assert lines["giga"][8].strip().startswith("+1.0") and [lines["ghg"][i].strip() for i in (1, 2)] == ["4", "3"]
     assert bench.trained_names(report) == ["paper", "ghg", "giga", "lhm"]
     report["runs"]["no global token"] = seeded(14.5, counts=(1, 2, 6))
-    text = train_all.table(report)
+    found = train_all.ablations(report)
+    assert list(found) == ["The global token", "Photos, over the number before"]  # of the others nothing is trained
+    gains = {tuple(line[:3]): line[3:] for line in found["The global token"][1]}
     assert (
-        "| global token | standard | PSNR, dB | +0.5" in text
-        and "| photos, over the number before | near | PSNR, dB | - | +0.0" in text
+        gains["standard", "another pose", "PSNR, dB"][0].startswith("+0.5") and ("near", "another pose", "PSNR, dB") not in gains
     )
+    photos = {tuple(line[:3]): line[3:] for line in found["Photos, over the number before"][1]}
+    assert (
+        photos["near", "pose of the photos", "PSNR, dB"][0] == "-" and "+-" in photos["near", "another pose", "LPIPS (Alex)"][3]
+    )
+    assert train_all.table(report).count("a gain is positive") == 2
 
 
 def test_runs_of_other_settings_are_not_mixed(tmp_path):
@@ -190,13 +206,13 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
 def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "MOST_ROUNDS", 2)
     out = tmp_path / "runs"
-    assert call(train_all.paper, [str(out), "--quick", "--only", "ghg"]) == 0
+    assert call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0
     report = json.loads((out / "results.json").read_text())
-    row = report["runs"]["ghg"]["0"]
+    row = report["runs"]["gps"]["0"]
     assert row["done"] and row["steps"] == 4 * len(row["curve"]) + 1 and row["operations"] > 0
-    assert len(row["scores"]["4"]["animation"]["lpips_alex"]) == 2
+    assert list(row["scores"]["4"]) == ["reconstruction"] and len(row["scores"]["4"]["reconstruction"]["lpips_alex"]) == 2
     before = (out / "results.json").stat().st_mtime_ns
-    assert call(train_all.paper, [str(out), "--quick", "--only", "ghg"]) == 0  # nothing is left to do
+    assert call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0  # nothing is left to do
     assert (out / "results.json").stat().st_mtime_ns == before
 
 
@@ -303,35 +319,76 @@ def test_people_with_many_targets_come_in_parts(monkeypatch):
 
 
 LAYOUTS = {
-    "thuman": {"seeds": made_up.SEEDS[:1], "texture_size": 256},
-    "avatarrex": {"frames": 5, "cameras": 4, "size": (90, 120)},
-    "thuman4": {"frames": 5, "cameras": 4, "size": (96, 84)},
+    "avatarrex": ("animation", {"frames": 2, "cameras": 4, "size": (48, 64)}),
+    "thuman4": ("reconstruction", {"frames": 2, "cameras": 5, "size": (56, 48)}),
+    "thuman": ("domains", {"texture_size": 128}),
 }
+"""The table that shows a data set, and how little of it is made up."""
+
+
+def checkpoint(path):
+    """Of a small network, as the authors store theirs."""
+    encoder, reader, decoder = paper_parts(tiny().model.architecture)
+    encoder, reader = encoder.clone(patch_size=64), reader.clone(sample_rgb=False, shells=())
+    decoder = decoder.clone(frame="canonical", residual_color=False)
+    state = to_release(init_humangs(jax.random.key(0), published().with_parts(encoder=encoder, reader=reader, decoder=decoder)))
+    state |= {"tpose_lbs_weights": np.zeros((10, 55), np.float32)}
+    save_file({key: np.array(value) for key, value in state.items()}, path)
+    return path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_tables_run_on_the_layouts_of_real_data(layout, tmp_path, capsys):
-    """One command trains a network, and measures it and other weights: with fixed views, and with inputs of several poses."""
-    data, body = made_up.WRITERS[layout](tmp_path / "raw", **LAYOUTS[layout]), tmp_path / "raw" / "body.npz"
+def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monkeypatch, capsys):
+    """Rows: a checkpoint that was converted; of THuman also the weights that are shipped and a network trained by the command."""
+    table, how = LAYOUTS[layout]
+    raw, converted, out = tmp_path / "raw", tmp_path / "converted.safetensors", tmp_path / "out.json"
+    data, body = made_up.WRITERS[layout](raw, vertices=800, **how), raw / "body.npz"
+    code, _, error = run_command(monkeypatch, capsys, "convert", checkpoint(tmp_path / "a.safetensors"), "--out", converted)
+    assert code == 0, error
+    rows_wanted, options = ["converted"], ["--body", str(body), "--weights", f"converted={converted}", "--only", table]
     if layout == "thuman":
-        settings = Settings("thuman", size=64, views=10, supersample=1, train=1, test=0)
-        preprocess(data, data := tmp_path / "scenes", str(body), settings, progress=False)
-    config, files = tiny(), [tmp_path / name for name in ("config.json", "other.safetensors", "out.json")]
-    (config_file, other, out) = files
-    config_file.write_text(config_to_json(dataclasses.replace(config, steps=2)))
-    save_weights(other, init_humangs(jax.random.key(0), config.model), config.model)
-    options = ["--data", str(data), "--body", str(body), "--weights", f"other={other}", "--near", str(data), "--other", str(data)]
-    options += ["--train", str(tmp_path / "mine"), "--train-on", str(data), "--config", str(config_file), "--json", str(out)]
-    assert call(tables.tables, options) == 0
+        for name, near in (("scenes", False), ("near", True)):
+            settings = Settings("thuman", size=64, views=10, factors=(2.0, 2.0) if near else (1.0, 1.75), supersample=1)
+            preprocess(data, tmp_path / name, str(body), dataclasses.replace(settings, train=1, test=1), progress=False)
+        (tmp_path / "config.json").write_text(config_to_json(dataclasses.replace(tiny(), steps=2)))
+        data, rows_wanted = tmp_path / "scenes" / "test.json", ["converted", "mine", rows.SHIPPED]
+        options += ["--other", str(tmp_path / "near" / "test.json"), "--train", str(tmp_path / "mine")]
+        options += ["--train-on", str(tmp_path / "scenes" / "train.json"), "--config", str(tmp_path / "config.json")]
+    else:
+        monkeypatch.setattr(rows, "load_weights", lambda path=converted: load_weights(path))  # the shipped ones take long
+    if layout == "thuman4":
+        chosen = tmp_path / "indices.json"
+        chosen.write_text(json.dumps({"subject00": {"context": [0, 1, 2, 3], "target": [4, 8]}}))
+        options += ["--indices", str(chosen)]
+    assert call(tables.tables, ["--data", str(data), *options, "--json", str(out)]) == 0
     text = capsys.readouterr().out
     numbers = json.loads(out.read_text())["numbers"]["tables"]["rows"]
-    assert all(f"| {name} | 4 photos |" in text for name in ("mine", "other")) and text.count("**") == 2 * len(tables.TABLES)
-    moved = numbers[f"mine, {data.name}, 4, varying poses"]["animation"]
-    assert (moved is None) == (layout == "thuman")  # of one pose
-    assert 0 < numbers[f"mine, {data.name}, 2"]["reconstruction"][0] < 60
-    name = next(iter(rows.views_of(data, 4, body, False)))
-    chosen = tmp_path / "indices.json"
-    chosen.write_text(json.dumps({name: {"context": [0, 1, 2, 3], "target": [4, 5]}}))
-    fixed = [*options[:6], "--indices", str(chosen), "--only", "reconstruction"]
-    assert call(tables.tables, fixed) == 0 and "| other | 4 photos |" in capsys.readouterr().out
+    assert all(f"| {name} | 4 photos |" in text for name in rows_wanted) and f"**{table}**" in text
+    key = {"avatarrex": "avatarrex_zzr, 4, varying poses", "thuman4": "subject00, 4", "thuman": "scenes, 4"}[layout]
+    found = numbers[f"converted, {key}"]
+    tasks = {"avatarrex": {"animation"}, "thuman4": {"reconstruction", "animation"}, "thuman": {"reconstruction"}}[layout]
+    assert {task for task in bench.TASKS if found[task]} == tasks and all(0 < found[task][0] < 60 for task in tasks)
+    if layout == "thuman":
+        assert numbers["converted, near, 4"]["reconstruction"] != found["reconstruction"]
+
+
+def test_people_of_one_name_are_refused(tmp_path):
+    options = tables.Compared(data=tmp_path / "a" / "x", near=tmp_path / "b" / "x")
+    with pytest.raises(ValueError, match="people in folders of one name: x, x: expected a name for each"):
+        tables.settings_of(options, ())
+    assert tables.title(tmp_path / "scenes" / "test.json") == "scenes"
+
+
+@pytest.mark.slow
+def test_training_at_the_published_size_starts():
+    """A step of both stages of `--config paper`, on shapes alone: eight people at 256 pixels, then four at 512."""
+    config, body = read_config("paper"), load_body()
+    state, networks = jax.eval_shape(lambda: init_state(config)), jax.eval_shape(lambda: random_networks(config))
+    assert sum(x.size for x in jax.tree.leaves(state.variables["params"])) == pytest.approx(98.8e6, rel=1e-3)
+    for start, people_a_step, side in ((0, 8, 256), (60_000, 4, 512)):
+        part = config.at(start)
+        batch = abstract_batch(part, len(body.parents), body.shape_directions.shape[-1])
+        assert batch.inputs.images.shape == batch.targets.images.shape == (people_a_step, 4, side, side, 3)
+        new, metrics = jax.eval_shape(functools.partial(update, config=part), state, batch, body, networks, seed_numbers(0))
+        assert jax.tree.map(jnp.shape, new.params) == jax.tree.map(jnp.shape, state.params) and metrics["loss"].shape == ()

@@ -11,8 +11,10 @@ from network_cases import random_inputs, random_variables
 from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import tube
 
+from experiments.systems import SYSTEMS
 from experiments.systems.correction import CorrectionMLP, apply_corrections
 from experiments.systems.pixel_queries import QueryDriver
+from experiments.systems.stereo import StereoDecoder, nearest_pair
 from experiments.systems.surface_gaussians import PoseAttention, PoseMapDriver, TextureDriver
 from experiments.systems.surface_map import SurfaceMap
 from experiments.systems.targets import PixelDriver, target_queries
@@ -24,6 +26,7 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.network.config import Architecture
 from humangs_jax.network.humangs import apply_humangs, part_variables
 from humangs_jax.network.parts import Driver, Encoding, Target
+from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -301,6 +304,69 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     odds = lambda sharpness: np.log(red(sharpness)[both] / (1 - red(sharpness)[both]))
     assert np.abs(odds(2.0)).max() > 0.1
     np.testing.assert_allclose(odds(4.0), 2 * odds(2.0), atol=1e-3)  # log odds grow in proportion
+
+
+# Pairs of photos -----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def stereo():
+    """A small GPS-Gaussian-style network, its variables, inputs of four photos, and their Gaussians."""
+    config = SYSTEMS["gps"]("bench").with_parts(decoder=StereoDecoder((4, 8), planes=6))
+    variables, inputs = random_variables(config), random_inputs(views=4, size=SIZE)
+    return config, variables, inputs, jax.jit(lambda x: apply_humangs(variables, x, config)[0].scene)
+
+
+def test_a_pixel_s_gaussian_has_its_color_and_lies_on_its_ray_near_the_body():
+    _, _, inputs, scene_of = stereo()
+    inputs = replace(inputs, foreground=inputs.foreground.at[:, :4].set(False))
+    found = scene_of(inputs).gaussians
+    close(found.colors.reshape(inputs.images.shape), inputs.images, bound=0)
+    opaque = np.asarray(found.opacities).reshape(4, SIZE, SIZE) > 0
+    np.testing.assert_array_equal(opaque, inputs.foreground)
+    for view in range(4):
+        pixels, depths = project_vertices(inputs.cameras[view], found.means[view])
+        centers = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), axis=-1).reshape(-1, 2) + 0.5
+        np.testing.assert_allclose(pixels, centers, atol=1e-3)
+        assert np.min(depths) > 1.5 and np.max(depths) < 4.5 and np.ptp(depths) > 0.01
+
+
+def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
+    _, _, inputs, scene_of = stereo()
+    scene, centers = scene_of(inputs), inputs.cameras.center  # at 0, 1.67, 3.33 and 5 radians
+    assert nearest_pair(scene, centers[0]).opacities.shape == (2 * SIZE**2,)
+    used = lambda center, scene: {i for i in range(4) if np.isin(inputs.images[i], nearest_pair(scene, center).colors).all()}
+    assert used(centers[0], scene) == {0, 3} and used(0.6 * centers[1] + 0.4 * centers[2], scene) == {1, 2}
+    padded = scene_of(replace(inputs, view_count=jnp.asarray(2)))
+    assert used(centers[3], padded) == {0, 1}  # the others are padding
+    lonely = nearest_pair(replace(padded, present=padded.present.at[1].set(False)), centers[0])
+    assert lonely.opacities[: SIZE**2].any() and not lonely.opacities[SIZE**2 :].any()
+    with pytest.raises(ValueError, match="1 photo: this system takes at least 2"):
+        nearest_pair(replace(scene, present=scene.present[:1]), centers[0])
+
+
+def test_depths_come_from_what_two_photos_have_in_common():
+    """With the learned scores at 0 a photo's depths depend on the nearest other photo, and on no third one."""
+    config, variables, inputs, _ = stereo()
+    zero = lambda path, x: 0 * x if path[-2].key == "0_out" else x
+    still = jax.tree_util.tree_map_with_path(zero, variables)
+    means = jax.jit(lambda x: apply_humangs(still, x, config)[0].scene.gaussians.means)
+    before, change = means(inputs), lambda i: replace(inputs, images=inputs.images.at[i].set(1 - inputs.images[i]))
+    moved = lambda i: np.abs(means(change(i)) - before).max(axis=(1, 2)) > 1e-6
+    assert moved(1)[1] and not moved(2)[0] and moved(3)[0]  # of photo 0 the nearest is 3
+
+
+@pytest.mark.slow
+def test_a_pair_of_photos_has_finite_gradients_and_shows_no_other_pose():
+    config, variables, inputs, _ = stereo()
+
+    def loss(params):
+        scene = apply_humangs({**variables, "params": params}, inputs, config)[0].scene
+        return sum(jnp.sum(jnp.sin(7 * x)) for x in jax.tree.leaves(nearest_pair(scene, inputs.cameras.center[1])))
+
+    for path, gradient in jax.tree_util.tree_leaves_with_path(jax.jit(jax.grad(loss))(variables["params"])):
+        assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0, path
+    assert not config.architecture.driver.moves
 
 
 # Parts ---------------------------------------------------------------------------------------------------------------
