@@ -32,7 +32,7 @@ from experiments.paper.rows import (
 )
 from experiments.results import markdown_table, significant
 from experiments.subjects import file_digest
-from humangs_jax.core.compiling import enable_compile_cache
+from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.subject import FileBody
 from humangs_jax.evaluation.scores import mean_scores
