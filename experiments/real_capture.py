@@ -23,10 +23,10 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import camera_gains, multiplied
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
+from humangs_jax.data.views import camera_gains, multiplied
 from humangs_jax.detection.people import LANDMARK_SIZE, DetectedPerson, Networks, bilinear, detect_people, sharpened
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score

@@ -105,7 +105,7 @@ def write_views(
 ) -> int:
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and views.exr if asked.
 
-    exposures: of the cameras, see `data.exposure`.
+    exposures: of the cameras, see `data.views`.
 
     The files appear together when all are drawn; other views of an earlier call are removed. Returns the number of views.
 

@@ -20,9 +20,9 @@ from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_argument
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import (
     SubjectViews,
+    equal_exposure,
     fits,
     gaussian_body,
     pad_views,

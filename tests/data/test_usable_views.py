@@ -17,8 +17,18 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data import views as module
 from humangs_jax.data.body_and_masks import _sampling, unusable_views, usable_views
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, exposures, gains_of, multiplied, with_gains
-from humangs_jax.data.views import greedy_cover, select_views, standardize
+from humangs_jax.data.views import (
+    EXPECTED,
+    camera_gains,
+    equal_exposure,
+    exposures,
+    gains_of,
+    greedy_cover,
+    multiplied,
+    select_views,
+    standardize,
+    with_gains,
+)
 from humangs_jax.refinement.photos import crop_to_person
 
 
