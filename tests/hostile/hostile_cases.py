@@ -148,11 +148,9 @@ for seed in (name for name, each in FORMATS.items() if each.make is not None):
 
 def all_cases() -> list[Case]:
     """Every case, those of all modules."""
-    import attacks_archives  # noqa: F401
     import attacks_arrays  # noqa: F401
-    import attacks_meshes  # noqa: F401
+    import attacks_binary  # noqa: F401
     import attacks_paths  # noqa: F401
-    import attacks_photos  # noqa: F401
     import attacks_pickles  # noqa: F401
     import attacks_text  # noqa: F401
 

@@ -38,7 +38,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.calibration.calibration import (
     CalibratedCamera,
     Calibration,
@@ -235,11 +235,13 @@ def folder_subject(
 
 def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """A photo on white where its mask is at most 128, and the mask as 0 and 1. Raises: CaptureError naming the file."""
-    image, _ = read_checked(read_image, photo)
-    person = read_checked(read_grey, mask) > ON_PERSON
+    return _cut_out(read_checked(read_image, photo)[0], read_checked(read_grey, mask) > ON_PERSON, mask, "size")
+
+
+def _cut_out(image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"], file: Path, field: str) -> Photo:
     if person.shape != image.shape[:2]:
         got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
-        raise CaptureError(mask, "size", f"{got}: expected the same")
+        raise CaptureError(file, field, f"{got}: expected the same")
     return np.where(person[..., None], image, np.float32(1)), person.astype(np.float32)
 
 
@@ -423,11 +425,7 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         cameras.append(_camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None))
 
     def read(photo: str, mask: str) -> Photo:
-        image = photos.image(photo)
-        person = (notes.image(mask).max(axis=-1) > ON_PERSON).astype(np.float32)
-        if person.shape != image.shape[:2]:
-            raise CaptureError(notes.path, mask, f"{person.shape}, its photo {image.shape[:2]}")
-        return np.where(person[..., None] > 0, image, np.float32(1)), person
+        return _cut_out(photos.image(photo), notes.image(mask).max(axis=-1) > ON_PERSON, notes.path, mask)
 
     calibration = Calibration("DNA-Rendering", notes.path, tuple(cameras), False, "integer", "+y")
     cameras = checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
