@@ -217,6 +217,11 @@ def evidence_residuals(
     return parts
 
 
+def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
+    """Thicknesses of clothes as their prior counts them."""
+    return jnp.where(clothing < 0, BARE * clothing, clothing)
+
+
 @functools.partial(jax.jit, static_argnames="independent")
 def solve_round(
     model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float
@@ -224,7 +229,7 @@ def solve_round(
     """The state after some steps with fixed matches."""
 
     def residuals(y):
-        counted = replace(y, clothing=jnp.where(y.clothing < 0, BARE * y.clothing, y.clothing))
+        counted = replace(y, clothing=_counted(y.clothing))
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     if sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS:
