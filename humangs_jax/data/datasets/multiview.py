@@ -238,7 +238,7 @@ def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float
     return _cut_out(read_checked(read_image, photo)[0], read_checked(read_grey, mask) > ON_PERSON, mask, "size")
 
 
-def _cut_out(image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"], file: Path, field: str) -> Photo:
+def _cut_out(image: Float[np.ndarray, "h w 3"], person: Bool[np.ndarray, "mh mw"], file: Path, field: str) -> Photo:
     if person.shape != image.shape[:2]:
         got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
         raise CaptureError(file, field, f"{got}: expected the same")
