@@ -107,7 +107,7 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
     with pytest.raises(ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"):
         run(videos, out, body, Settings("avatarrex", "scenes", 32, every=1))
     (out / "avatarrex_a" / "scene.json").write_text('{"known": {"views": true}}')
-    with pytest.raises(ValueError, match=r"avatarrex_a/scene.json: known.views: expected a whole number"):
+    with pytest.raises(ValueError, match=r"avatarrex_a/scene.json: known.views: expected an integer, got True"):
         run(videos, out, body, settings())
     with pytest.raises(ValueError, match="lies in the data set"):
         run(videos, videos / "out", body, settings())
