@@ -45,11 +45,11 @@ ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None)
 COLUMNS = {  # heading and digits
     "psnr": ("PSNR", 2),
     "ssim": ("SSIM", 3),
-    "lpips": ("LPIPS", 4),
+    "lpips": ("LPIPS", 3),
     "psnr_fg": ("foreground PSNR", 2),
     "baseline_psnr": ("vertex-color baseline: PSNR", 2),
     "baseline_ssim": ("SSIM", 3),
-    "baseline_lpips": ("LPIPS", 4),
+    "baseline_lpips": ("LPIPS", 3),
     "baseline_psnr_fg": ("foreground PSNR", 2),
 }
 EXTREMES = 5

@@ -221,16 +221,17 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
     if people["settings"]["weights"] != refined["settings"]["weights"]:
         raise ValueError("evaluation_views and appearance are of different weights: measure them again")
     scored = lambda size, task: refined["means"]["all"][f"{size} 0 {task}"]["default"]
+    columns = {"psnr": 1, "psnr_fg": 1, "alex": 3}
+    own = {"psnr": "psnr", "psnr_fg": "psnr_fg"} | ({"alex": "lpips"} if people["settings"].get("lpips_net") == "alex" else {})
     feed_forward = people["by_views"]["4"]["novel"]
     rows = {
-        f"{people['people']} synthetic people, 256 px, feed-forward": feed_forward,
+        f"{people['people']} synthetic people, 256 px, feed-forward": {name: feed_forward[key] for name, key in own.items()},
         f"{refined['people']} of them, as `humangs reconstruct` makes them": scored(256, "novel"),
         "the same, 512 px": scored(512, "novel"),
         "the same, 512 px, in poses that no photo shows": scored(512, "animation"),
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
-        "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{name}") for name in ("psnr", "psnr_fg")},
+        "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{key}") for name, key in own.items()},
     }
-    columns = {"psnr": 1, "psnr_fg": 1, "alex": 3}
     shown = lambda scores: ["" if scores.get(key) is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
     header = ["", "PSNR", "foreground PSNR", "LPIPS (Alex)"]
     return markdown_table(header, [[name, *shown(scores)] for name, scores in rows.items()])

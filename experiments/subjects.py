@@ -119,7 +119,7 @@ class Start(NamedTuple):
         return (
             f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
             f"held-out views in the pose of the photos, {s['poses']} x {s['pose_views']} in novel poses; "
-            f"weights {s['weights'][:12]}, tokens: {s['tokens']}."
+            f"weights {s['weights'][:12]}, tokens: {s['tokens']}" + (f"; LPIPS {s['lpips_net']}." if s["lpips_net"] else ".")
         )
 
 

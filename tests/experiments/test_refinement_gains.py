@@ -41,7 +41,7 @@ DEMO = SCORES | {
 
 def test_readme_quality_is_of_the_same_weights():
     settings = {"settings": {"weights": "a"}, "people": 3}
-    baseline = {"baseline_psnr": 20.67, "baseline_psnr_fg": 11.28}
+    baseline = {"baseline_psnr": 20.67, "baseline_psnr_fg": 11.28, "baseline_lpips": 0.1444, "lpips": 0.0712}
     people = settings | {"by_views": {"4": {"novel": SCORES | baseline}}}
     seen = {"default": SCORES | {"alex": 0.0506}, "iterations alone": {}}
     cells = {f"{size} 0 {task}": seen for size in (256, 512) for task in ("novel", "animation")}
@@ -52,6 +52,9 @@ def test_readme_quality_is_of_the_same_weights():
     assert rows[1] == "| 2 of them, as `humangs reconstruct` makes them | 27.4 | 18.8 | 0.051 |"
     assert rows[4] == "| the demo's person, 256 px, refined for 15 s | 29.2 | 18.8 |  |"
     assert rows[5] == "| vertex-color baseline, 256 px | 20.7 | 11.3 |  |"
+    alex = people | {"settings": {"weights": "a", "lpips_net": "alex"}}
+    rows = readme_quality(demo, alex, refined).splitlines()[2:]
+    assert rows[0].endswith("| 18.8 | 0.071 |") and rows[5].endswith("| 11.3 | 0.144 |")
     for said, changed in {
         "expected `humangs demo` without": (DEMO, people, refined),
         "of different weights": (demo, people, refined | {"settings": {"weights": "b"}}),
