@@ -108,7 +108,7 @@ class Case:
         config, body = self.config, load_body()
         size = config.model.conventions.image_size
         cache = CaptureCache([written_subject(folder, config, body)], body)
-        source = CaptureSource(cache, config.views, size, config.target_size)
+        source = CaptureSource(cache, config.views, size, config.target_size, config.loss.depth > 0)
         self.body = gaussian_body(body, config.model)
         self.batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
         if config.model.tokens == "foreground":

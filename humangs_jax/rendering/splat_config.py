@@ -60,8 +60,8 @@ class SplatConfig:
     """Alphas are clamped to it."""
     transmittance_stop: Share = knob(
         TRANSMITTANCE_STOP,
-        cost="65 dB at 0.001, 45 dB at 0.01",
-        gain="5 % of the time with gradients at 0.001, 13 % at 0.01",
+        cost="55 dB at 0.001, 40 dB at 0.01",
+        gain="6 % of the time with gradients at 0.001, 10 % at 0.01",
         measured=MEASURED,
     )
     """A pixel ends before its transmittance would fall to this."""
@@ -69,12 +69,12 @@ class SplatConfig:
     """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat."""
     normalize_quats: bool = True
     """False: quaternions are not normalised, as in INRIA's rasterizer."""
-    opacity_min: Share = knob(0.0, cost="61 dB at 0.1, 38 dB at 0.4", gain="8 % of the time at 0.4", measured=MEASURED)
+    opacity_min: Share = knob(0.0, cost="56 dB at 0.1, 40 dB at 0.4", gain="11 %, 18 % of the time", measured=MEASURED)
     """Gaussians of lower opacity are not drawn at all."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
         None,
-        cost="54 dB at 2.5, 44 dB at 2, 36 dB at 1.5; splats are cut at tile borders",
-        gain="16 %, 28 %, 39 % of the time",
+        cost="61 dB at 2.5, 52 dB at 2, 46 dB at 1.5; splats are cut at tile borders",
+        gain="14 %, 27 %, 35 % of the time",
         measured=MEASURED,
     )
     """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its footprint meets. None: where
@@ -83,13 +83,16 @@ class SplatConfig:
     """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard deviation,
     rounded up to pixels, at tiles as INRIA counts them."""
     scale: Annotated[float, Range(1e-3, 16)] = knob(
-        1.0, cost="36 dB at 0.5", gain="a fifth of the time at 0.5 (not of projection and sorting)", measured=MEASURED
+        1.0,
+        cost="38 dB at 0.5",
+        gain="7 % of the time at 0.5, 18 % with gradients (not of projection and sorting)",
+        measured=MEASURED,
     )
     """The image is drawn at this fraction of its resolution, and resized (bilinear)."""
     visibility: bool = knob(
         False,
         cost="memory of one number a Gaussian",
-        gain="`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.51 of the time at 52.6 dB",
+        gain="`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.75 of the time at 53.9 dB",
         measured=MEASURED,
     )
     """Whether `Rendering.visibility` is computed."""
