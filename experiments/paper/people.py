@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
+import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.library import load_body
@@ -96,7 +97,7 @@ def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
     pose = np.array(cameras.cam_from_world)
     at = pose[:, :3, :3] @ middle + pose[:, :3, 3]
     pose[:, :3, 3] -= (1 - NEARER) * at
-    return replace(cameras, cam_from_world=pose)
+    return replace(cameras, cam_from_world=jnp.asarray(pose))
 
 
 class OnePose(CaptureFolder):
