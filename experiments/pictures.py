@@ -56,7 +56,7 @@ def _half(name, seeds, rows, strips):
         for task in tasks:
             scores = rows[seed][task]
             images += [cropped(image) for image in strips[seed][task]]
-            labels += [f"seed {seed}", f"ours {scores['psnr']:.1f} dB", f"painted {scores['baseline_psnr']:.1f} dB"]
+            labels += [f"seed {seed}", f"ours {scores['psnr']:.1f} dB", f"baseline {scores['baseline_psnr']:.1f} dB"]
     sheet = tile(np.stack(images) / 255, labels=labels, columns=len(TRIPLE) * len(tasks))
     strip = np.ones((TITLE + 2 * GAP, sheet.shape[1], 3))
     width = sheet.shape[1] // len(tasks)

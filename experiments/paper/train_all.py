@@ -189,10 +189,10 @@ def table(report: Mapping[str, Any]) -> str:
     header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
     settings = report["settings"]
     said = (
-        f"{settings['test_people']} test people; rounds of {settings['round_steps']} steps, a last quarter of one with the "
-        f"perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on the "
-        f'validation people, or where a run is flat; "{NOT_TRAINED}": it has not got there, or the perceptual loss has taken it '
-        "below the baseline. Intervals: 95 %, over people and seeds."
+        f"{settings['test_people']} test people. A run has rounds of {settings['round_steps']} steps, then a quarter as many "
+        f"with the perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the {PAINTED}, which has {least:.2f} dB on "
+        f'the validation people, or where a run is flat; "{NOT_TRAINED}": it has not got there, or the perceptual loss has '
+        "taken it below the baseline. Intervals: 95 %, over people and seeds."
     )
     texts = [markdown_table(header, lines), said]
     if counted:

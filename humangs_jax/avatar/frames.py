@@ -429,7 +429,7 @@ def render_in_bands(
 
 
 def banded(camera: Camera, height: int) -> Camera:
-    """Cameras of the bands of so many rows, from the top; the last may reach beyond the image."""
+    """A camera for each band of `height` rows, from the top; the last band may reach beyond the image."""
     tops = np.arange(0, camera.height, height)
     shift = jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))
     poses = jnp.broadcast_to(camera.cam_from_world, (len(tops), 4, 4))

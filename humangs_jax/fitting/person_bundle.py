@@ -173,7 +173,7 @@ def _residuals(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"], scal
     rig = _moved(evidence, start, y)
     turned, root = _turned(rig), np.sqrt(evidence.weights)[..., None]
     errors = _pixel_errors(evidence, rig, turned) / evidence.noise[:, None, None]
-    errors = errors * (scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True)))  # as `solve.robust`
+    errors = errors * (scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True)))  # as `state.robust`
     share = evidence.weights / evidence.weights.sum(axis=1, keepdims=True)
     centered = turned - np.sum(share[..., None] * turned, axis=-2, keepdims=True)
     radius = lambda points: 0.5 * np.log(np.sum(share[..., None] * points**2, axis=(-2, -1)).sum(-1) + 1e-12)

@@ -26,7 +26,7 @@ from humangs_jax.geometry.transform import EXACT
 RIDGE = 1e-6
 """Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
 REWEIGHTED = 3
-"""Rounds of weighting the rays by the distance of the last point."""
+"""Iterations that weight the rays by the distance of the last point."""
 PAIRS_AT_ONCE = 16
 """Pairs of views whose proposals are compared with all views at once: memory does not grow with the number of pairs."""
 MARGIN = 6.0
@@ -114,7 +114,7 @@ def _nearest(
 # Similarities ----------------------------------------------------------------------------------------------------------
 
 ITERATIONS = 10
-"""Rounds of reweighting by the distances."""
+"""They reweight the points by their distances."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -158,8 +158,8 @@ def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
 
 LARGEST_PSNR = 100.0
 """dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
-FOG = (0.05, 0.9)
-"""Alphas between these are semi-transparent foreground."""
+SEMI_TRANSPARENT = (0.05, 0.9)
+"""Between these alphas the foreground is semi-transparent."""
 BOUNDARY = 3 / 256
 """Half the width of the band at the silhouette, of the image's side."""
 
@@ -181,9 +181,9 @@ def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"],
 
 
 def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Share of the pixels of a mask where alpha is neither near 0 nor near 1, see `FOG`; 0 where the mask is empty."""
+    """Share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask is empty."""
     inside = mask > 0.5
-    partly = (alpha > FOG[0]) & (alpha < FOG[1]) & inside
+    partly = (alpha > SEMI_TRANSPARENT[0]) & (alpha < SEMI_TRANSPARENT[1]) & inside
     return jnp.sum(partly) / jnp.maximum(jnp.sum(inside), 1)
 
 

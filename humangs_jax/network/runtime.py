@@ -119,7 +119,7 @@ class Conventions:
     """Gaussians between the legs farther than this from their vertex, metres, move with both (`body.model.spread_weights`);
     None: all with their vertex."""
     light: bool = False
-    """Other poses are drawn in the light of the photos (`avatar.light`)."""
+    """Other poses are drawn in the light of the photos (`Avatar.light`)."""
     low_pass: Length | None = None
     """Metres that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
     (`avatar.low_pass`); None: it stays with the renderer."""

@@ -463,7 +463,7 @@ def follow(
 
 
 def show_newest(view: LiveView, path: Path, photos: Capture | None, shown: tuple | None) -> tuple | None:
-    """Show what lies at `path` if it is not the file that `shown` stands for; what stands for the file that is shown now.
+    """Show the file at `path` unless it is shown already. Returns its time and size, which is `shown` in the next call.
 
     photos: of the person that the weights of the run in `path` reconstruct; None: `path` is an avatar file. A file that cannot be
     read is reported in the page, once.

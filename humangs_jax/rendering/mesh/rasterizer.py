@@ -314,7 +314,7 @@ def gouraud_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """The release's position map (lit; see the module) and depth map of one view; everything in normalised units."""
+    """The release's position map (lit by a point light) and depth map of one view; everything in normalised units."""
     albedo = (canonical_vertices + 1) / 2
     colors = _light(albedo, posed_vertices, vertex_normals(posed_vertices, faces), camera.center)
     return _map(posed_vertices, 2 * colors - 1, faces, camera, config)

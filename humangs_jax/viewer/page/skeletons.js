@@ -1,4 +1,4 @@
-// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/data/motion/bvh.py and skeleton.py.
+// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/data/motion/clips.py and skeleton.py.
 
 const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
 
