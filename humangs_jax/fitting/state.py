@@ -390,7 +390,7 @@ def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarra
 
 
 def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigin:
-    """Cameras as they are: views of equal K and cam_from_world are of one camera that stood still. So are equal focal lengths."""
+    """Views of equal K and cam_from_world are of one camera that stood still; equal focal lengths stay equal."""
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
     focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)

@@ -254,3 +254,8 @@ def test_colors_have_names_and_numbers():
     assert Shot(background=" Transparent ").color() is None
     assert Shot(background="#336699").color() == (0.2, 0.4, 0.6)
     assert Shot(width=20).resolution == (20, 512) and Shot(size=9, height=5).resolution == (9, 5)
+
+
+def test_each_frame_needs_a_camera():
+    with pytest.raises(ValueError, match="zip"):
+        list(frames.draw_gaussians(iter([blobs()]), iter([])))

@@ -455,3 +455,10 @@ def test_views_are_padded_to_a_number_not_below_their_own():
     assert np.array_equal(padded.images[:2], views.images) and np.array_equal(padded.rotations[2], views.rotations[1])
     with pytest.raises(ValueError, match="2 views cannot be padded to 1"):
         pad_views(views, 1)
+
+
+def test_the_place_of_a_number_that_is_none_is_named(body, network):
+    photos = capture(body, SIZE, SIZE)
+    photos.images[0, 3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"reconstruct: capture: images: .*\[0, 3, 4, 1\]: nan"):
+        reconstruct(*network, photos)

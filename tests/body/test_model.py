@@ -100,3 +100,14 @@ def test_missing_coefficients_are_zero_and_surplus_ones_refused():
     assert np.allclose(short.vertices, padded.vertices, atol=ATOL)
     with pytest.raises(ValueError, match="5 shape coefficients, but body"):
         shape_body(body, jnp.zeros(5))
+
+
+def test_vmap_over_shapes_and_poses_equals_a_loop():
+    body = made_up_body(5, dtype=np.float32)
+    cases = [(np.random.default_rng(i).normal(size=4), *random_pose(i)) for i in range(3)]
+    batched = [jnp.asarray(np.stack(x), jnp.float32) for x in zip(*cases, strict=True)]
+    found = jax.jit(jax.vmap(posed, (None, 0, 0, 0)))(body, *batched)
+    for i, case in enumerate(cases):
+        one = posed(body, *case)
+        assert np.allclose(found.vertices[i], one.vertices, atol=ATOL)
+        assert np.allclose(found.joint_transforms[i], one.joint_transforms, atol=ATOL)

@@ -144,3 +144,11 @@ def test_the_experiment_shows_its_table_and_fails_on_a_bound(monkeypatch, capsys
     assert call(cases.splatting_numerics, ["--only", "opacity: 0"]) == status
     text = capsys.readouterr().out
     assert "opacity: 0" in text and ("FAILED" in text) == (status == 1)
+
+
+def test_coincident_depths_keep_the_order_of_their_indices():
+    scene, reverse = (cases.coincident(r) for r in (False, True))
+    image, other = (cases.tiled(s)[0].rgb for s in (scene, reverse))
+    assert np.abs(image - other).max() > 0.1  # the order is visible
+    assert np.ptp(scene.gaussians.means[:, 2]) == 0
+    np.testing.assert_allclose(image, cases.reference_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)

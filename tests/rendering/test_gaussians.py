@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import humangs_jax as hg
@@ -106,3 +107,18 @@ def test_deformations_are_refused():
     deformed = replace(within_bounds(), deformations=jnp.tile(jnp.eye(3), (COUNT, 1, 1)))
     with pytest.raises(ValueError, match="factored"):
         hg.unconstrain(deformed)
+
+
+def test_optax_never_leaves_the_domain():
+    optimizer, parameters = optax.adam(1.0), hg.unconstrain(within_bounds())
+    state = optimizer.init(parameters)
+
+    def loss(parameters):
+        g = hg.constrain(parameters)
+        return sum(jnp.sum(jnp.square(x - 2.0)) for x in (g.opacities, g.colors, g.scales))
+
+    for _ in range(20):
+        updates, state = optimizer.update(jax.grad(loss)(parameters), state)
+        parameters = optax.apply_updates(parameters, updates)
+    after = hg.constrain(parameters)
+    assert ((after.opacities > 0) & (after.opacities <= 1)).all() and (after.colors <= 1).all() and (after.scales > 0).all()
