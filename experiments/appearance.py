@@ -216,13 +216,16 @@ def forward_pass(
     networks = {"alex": load_lpips("alex")}
     rows: dict[str, tuple[Any, Any]] = {"as it is": (start.variables, start.config)}
     rows |= {name: (changed(start.variables, *change), start.config) for name, change in DECODERS.items()}
-    for name, _, file in (text.partition("=") for text in runs):
-        variables, config = load_weights(Path(file))
+    if wrong := [text for text in runs if "=" not in text]:
+        raise ValueError(f"--runs {wrong[0]!r}: expected NAME=FILE")
+    files = {name: Path(file) for name, file in (text.split("=", 1) for text in runs)}
+    for name, file in files.items():
+        variables, config = load_weights(file)
         rows[name] = (
             variables,
             dataclasses.replace(start.config, architecture=config.architecture, conventions=config.conventions),
         )
-    settings = start.settings | {"runs": {text.partition("=")[0]: file_digest(Path(text.partition("=")[2])) for text in runs}}
+    settings = start.settings | {"runs": {name: file_digest(file) for name, file in files.items()}}
 
     def measure(seed):
         subject = make_evaluation_subject(seed, start.body, (VIEWS,), start.size, start.held_out)
