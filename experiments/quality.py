@@ -176,18 +176,24 @@ def light(run: Run, people: People = People(16), sheet: Path | None = None) -> N
     sheet: JPEG of an novel pose of every person: truth, without and with the light
     """
     start = people.start()
+    settings = start.settings | {"refiner": shipped_digest(SHIPPED_REFINER)}
     cases = {str(seed): functools.partial(_light_of, start, seed) for seed in start.seeds}
-    mean = means(list(run.rows(cases, start.settings, again=bool(sheet)).values()))
+    mean = means(list(run.rows(cases, settings, again=bool(sheet)).values()))
     if sheet:
         write_triples(sheet, run.pictures, 2, ("truth", "fixed colors", "light of the photos"))
-    rows, shown = [], lambda scores: [f"{scores[key]:.2f}" for key in ("psnr", "psnr_fg")]
+    keys = ("psnr", "psnr_fg", *(["lpips"] if start.lpips else []))
+    rows = []
     for name, tasks in mean.items():
         photos, avatar, lit = name.split(", ") if ", " in name else ("", "true surface, fixed colors", "")
-        rows.append([photos, avatar, lit, *(shown(tasks["novel"]) if photos else ["", ""]), *shown(tasks["animation"])])
-    scores = ["poses of the photos: PSNR", "foreground PSNR", "novel poses: PSNR", "foreground PSNR"]
-    table = markdown_table(["photos of", "avatar", "light", *scores], rows, "lllrrrr")
-    about = f"Means over {len(start.seeds)} people of the {people.split} seeds, four photos of {people.size} px; dB."
-    run.show(f"{about}\n\n{table}", {"settings": start.settings, "means": mean})
+        of_photos = cells(tasks["novel"], keys) if photos else [""] * len(keys)
+        rows.append([photos, avatar, lit, *of_photos, *cells(tasks["animation"], keys)])
+    headings = [COLUMNS[key][0] for key in keys[1:]]
+    scores = ["poses of the photos: PSNR", *headings, "novel poses: PSNR", *headings]
+    table = markdown_table(["photos of", "avatar", "light", *scores], rows, "lll" + "r" * len(scores))
+    about = f"Means over {len(start.seeds)} people of the {people.split} seeds, four photos of {people.size} px; dB" + (
+        f"; LPIPS {people.lpips_net}." if start.lpips else "."
+    )
+    run.show(f"{about}\n\n{table}", {"settings": settings, "means": mean})
 
 
 def _light_of(start, seed):
@@ -210,7 +216,7 @@ def _light_of(start, seed):
         for task, chosen in (("novel", seen), ("animation", [LIGHT_POSES - 2, LIGHT_POSES - 1])):
             at = np.flatnonzero(np.isin(frames, chosen))
             alone = dataclasses.replace(truth.select(at), frames=np.zeros(len(at), int))
-            by_task[task] = score_tasks(drawn[at], alone)["novel"]
+            by_task[task] = score_tasks(drawn[at], alone, start.lpips)["novel"]
         return by_task
 
     for name, photographed in of_photos.items():

@@ -18,6 +18,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.losses.losses import semi_transparent
+from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import SHIPPED
 from humangs_jax.refinement.refine import refine_with_report
@@ -27,16 +28,19 @@ DEGREES, SHAPES = 0.2, 0.02
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_fg": ("foreground PSNR", 2),
-    "psnr_boundary": ("boundary", 2),
-    "semi_transparent": ("semi_transparent", 3),
+    "lpips": ("LPIPS", 3),
+    "psnr_boundary": ("silhouette", 2),
+    "semi_transparent": ("semi-transparent foreground", 3),
 }
+OF_POSES = ("psnr", "psnr_fg", "lpips")
+"""Of `SHOWN`, those that tables have of novel poses."""
 
 
 @entry
 def refinement(
     run: Run,
     people: People = People(8),
-    seconds: tuple[float, ...] = (1, 2, 5, 15),
+    seconds: tuple[float, ...] = (1, 5, 15),
     sizes: tuple[int, ...] = (256, 512),
     views: tuple[int, ...] = (4,),
     iterations: tuple[int, ...] = (0, ITERATIONS),
@@ -57,7 +61,7 @@ def refinement(
     views: numbers of photos
     iterations: of the learned update; 0: Adam alone
     off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2 degrees, shapes change by 0.02
-    refine_poses: the pose of each photo is refined, too
+    refine_poses: once more with all iterations, and the pose of each photo refined, too
     plot: PSNR against seconds
     sheet: truth, feed-forward and the longest run of every person, largest size
     details_sheet: the same of faces, hands, hems and shoes
@@ -66,16 +70,17 @@ def refinement(
     settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "off": off}
     settings |= {"iterations": iterations, "refine_poses": refine_poses}
     settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
+    hows = {f"{n} iterations, Adam" if n else "Adam": RefineConfig(iterations=n) for n in iterations}
+    if refine_poses:
+        hows["the same, poses too"] = RefineConfig(iterations=max(iterations), poses=True)
 
     def measure(seed):
         row, pictures = {}, None
         for size in sizes:
             subject = make_evaluation_subject(seed, start.body, views, size, start.held_out)
-            for count, wrong, learned in itertools.product(views, off, iterations):
-                how = RefineConfig(iterations=learned, poses=refine_poses)
-                cell, drawn = _refined(start, with_body_off(subject, wrong), count, how, seconds)
-                also = f", {learned} iterations" if learned else ""
-                row[f"{size} {count} network{also}" + (f", body {wrong:g} mm off" if wrong else "")] = cell
+            for count, wrong, how in itertools.product(views, off, hows):
+                cell, drawn = _refined(start, with_body_off(subject, wrong), count, hows[how], seconds)
+                row[f"{size} {count} {wrong:g} {how}"] = cell
                 pictures = drawn if count == max(views) else pictures
         return row, pictures
 
@@ -116,21 +121,21 @@ def _refined(start, subject, count, how, seconds):
     inputs = subject.inputs(count)
     avatar = reconstruct(start.variables, start.config, inputs)
     view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
-    scores, first = score_all(avatar, subject.held_out, view)
+    scores, first = score_all(avatar, subject.held_out, start.lpips, view)
     cell, last = {"0": scores}, first
     for length in seconds:
         refined = refine_with_report(avatar, inputs, dataclasses.replace(how, seconds=length))
-        scores, last = score_all(refined.avatar, subject.held_out, view)
+        scores, last = score_all(refined.avatar, subject.held_out, start.lpips, view)
         about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
     drawn = (subject.held_out.images[view], first, last)
     return cell, (drawn, [np.concatenate(list(details(image, subject.held_out, view)), axis=1) for image in drawn])
 
 
-def score_all(avatar: Any, held_out: Any, view: int = 0) -> tuple[dict[str, Any], np.ndarray]:
+def score_all(avatar: Any, held_out: Any, lpips: Lpips | None = None, view: int = 0) -> tuple[dict[str, Any], np.ndarray]:
     """Scores by task, also the semi-transparent foreground of the true images, and the image of a view."""
     drawn = draw_views(avatar, held_out)
-    scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)
+    scores = score_tasks(drawn.images, held_out, lpips, drawn.alpha)
     for task, views in task_views(held_out).items():
         if task in scores:
             true = [float(semi_transparent(mask, mask)) for mask in held_out.masks[views]]
@@ -151,18 +156,26 @@ def refinement_means(rows: list[Any]) -> dict[str, Any]:
 
 
 def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people: int) -> str:
-    """The table of the page."""
-    header = ["photos", "start", "seconds", "task", *(heading for heading, _ in SHOWN.values()), "worst-subject gain"]
-    rows = []
+    """The table of the page. Starts are shown once: they are those of all ways to refine."""
+    first, off, rows, begun = next(iter(numbers.values()))["0"], any(settings["off"]), [], set()
+    wanted = {"novel": tuple(SHOWN), "animation": OF_POSES}
+    columns = [(t, k) for t in TASKS if t in first for k in wanted[t] if first[t].get(k) is not None]
     for name, lengths in numbers.items():
-        size, count, start = name.split(" ", 2)
+        size, count, wrong, how = name.split(" ", 3)
+        what = [f"{count} of {size} px", *([f"{wrong} mm"] if off else [])]
         for seconds, cell in lengths.items():
-            for task in (task for task in TASKS if task in cell):
-                scores = [f"{cell[task][key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
-                least = f"{cell['least_gain']:.2f}" if task == "novel" and seconds != "0" else ""
-                rows.append([f"{count} of {size} px", start, seconds, TASKS[task], *scores, least])
+            scores = [f"{cell[task][key]:.{SHOWN[key][1]}f}" for task, key in columns]
+            if seconds != "0":
+                rows.append([*what, how, seconds, *scores, f"{cell['least_gain']:.2f}"])
+            elif tuple(what) not in begun:
+                begun.add(tuple(what))
+                rows.append([*what, "none", seconds, *scores, ""])
+    names = [(f"{TASKS[task]}: " if key == "psnr" else "") + SHOWN[key][0] for task, key in columns]
+    header = ["photos", *(["body off"] if off else []), "refinement", "seconds", *names, "worst-subject gain"]
     about = (
-        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; worst-subject gain: the least of any person."
+        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB"
+        + (f"; LPIPS {settings['lpips_net']}" if settings.get("lpips_net") else "")
+        + "; worst-subject gain: the least of any person in novel views."
     )
     true = {
         name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
@@ -171,7 +184,7 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
     }
     shares = ", ".join(f"{share:.3f} at {size} px" for size, share in true.items())
     about += f" Semi-transparent foreground of the true images: {shares}." if true else ""
-    return f"{about}\n\n{markdown_table(header, rows, 'llll' + 'r' * (len(SHOWN) + 1))}"
+    return f"{about}\n\n{markdown_table(header, rows, 'l' * (3 + off) + 'r' * (len(columns) + 1))}"
 
 
 def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
@@ -179,10 +192,10 @@ def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
     with figure(path, 2, (9, 3.6), legend=0.2) as axes:
         for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole image", SHOWN["psnr_fg"][0]), strict=True):
             for i, (name, lengths) in enumerate(numbers.items()):
-                size, count, start = name.split(" ", 2)
+                size, count, _, how = name.split(" ", 3)
                 for task, style in zip(TASKS, ("o-", "s--"), strict=True):
                     values = [cell[task][key] for cell in lengths.values() if task in cell]
-                    label = f"{count} photos of {size} px, {start}: {TASKS[task]}"
+                    label = f"{count} photos of {size} px, {how}: {TASKS[task]}"
                     axis.plot([float(x) for x in lengths][: len(values)], values, style, ms=4, color=f"C{i}", label=label)
             axis.set(xlabel="seconds", ylabel="PSNR, dB", title=title)
             axis.set_xscale("symlog", linthresh=1)

@@ -73,7 +73,7 @@ class People:
     tokens: Literal["all", "foreground"] | None = None
     lpips_backbone: Path | None = None
     lpips_heads: Path | None = None
-    lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
+    lpips_net: Literal["vgg", "alex", "squeeze"] = "alex"
 
     def start(self) -> "Start":
         """Reads what is needed. Raises: ValueError that names the option that is out of range."""

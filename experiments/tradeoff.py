@@ -44,6 +44,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.io.images import resized
+from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.people.subject import GENERATOR_VERSION, seeds_of
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
@@ -55,7 +56,8 @@ PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 FRAMES = 10
 """Timed iterations of drawing a frame."""
-QUALITY = ("psnr", "ssim", "psnr_fg")
+QUALITY, NET = ("psnr", "ssim", "psnr_fg", "lpips"), "alex"
+"""LPIPS of this network, where the extra `lpips` is installed."""
 
 
 @entry
@@ -69,7 +71,7 @@ def tradeoff(
     image: Path | None = None,
     front: bool = False,
 ) -> None:
-    """Speed against accuracy of the whole path: some 70 settings, their front, and presets. 50 minutes on one core.
+    """Speed against accuracy of the whole path: some 60 settings, their front, and presets. Half an hour on one core.
 
     Tables: tradeoff, tradeoff_presets
 
@@ -104,7 +106,8 @@ def tradeoff(
 
 def settings_of() -> dict[str, Any]:
     """What all points depend on."""
-    return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, **SHOTS}
+    net = NET if installed_lpips() else None
+    return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, "lpips_net": net, **SHOTS}
 
 
 def described(point) -> dict[str, Any]:
@@ -159,6 +162,7 @@ class Bench:
         seeds = seeds_of("tradeoff", 0, subjects)
         self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
         self.default, self.iterations = DEFAULT, iterations
+        self.lpips = load_lpips(NET) if installed_lpips() else None
         self.kept: dict[Any, Any] = {}
         self.default_avatar = self.made(DEFAULT, 0)
 
@@ -201,14 +205,14 @@ class Bench:
         """Scores by task, of frames brought to the size of the truth."""
         truth = person.held_out
         if point.start == "vertex-color baseline":
-            return score_tasks(draw_painted_body(avatar, truth), truth)
+            return score_tasks(draw_painted_body(avatar, truth), truth, self.lpips)
         avatar = self.pruned(point, avatar, truth)
         poses, cameras = capture_views(avatar, truth)
         cameras = cameras.resized(point.size, point.size)
         drawn = [np.clip(np.asarray(r.rgb), 0, 1) for r in draw(avatar, poses, cameras, how=self.how(point, avatar))]
         if point.size != TRUE_SIZE:
             drawn = [resized(image, TRUE_SIZE, TRUE_SIZE) for image in drawn]
-        return score_tasks(np.stack(drawn), truth)
+        return score_tasks(np.stack(drawn), truth, self.lpips)
 
     def pruned(self, point, avatar, held_out):
         """Without what the held-out views do not show, where the point says so."""

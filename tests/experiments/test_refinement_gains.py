@@ -12,21 +12,29 @@ from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
-SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_fg": 18.75, "semi_transparent": 0.1, "psnr_boundary": 15.0}
+SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_fg": 18.75, "semi_transparent": 0.1, "psnr_boundary": 15.0, "lpips": None}
 
 
-def row(*psnrs, name="256 4 network"):
+def row(*psnrs, name="256 4 0 Adam"):
     tasks = lambda psnr: dict.fromkeys(("novel", "animation"), SCORES | {"psnr": psnr})
     return {name: {seconds: tasks(psnr) for seconds, psnr in zip(("0", "5"), psnrs, strict=True)}}
 
 
 def test_means_gains_and_the_table():
     means = refinement_means([row(20.0, 22.0), row(24.0, 24.5)])
-    cell = means["256 4 network"]["5"]
+    cell = means["256 4 0 Adam"]["5"]
     assert cell["novel"]["psnr"] == 23.25 and cell["least_gain"] == 0.5
-    table = refinement_section(means, {"split": "test"}, 2)
-    assert "| 4 of 256 px | network | 5 | novel views | 23.25 | 18.75 | 15.00 | 0.100 | 0.50 |" in table
-    assert "| 4 of 256 px | network | 0 | novel views | 22.00 | 18.75 | 15.00 | 0.100 |  |" in table
+    means |= {"256 4 0 4 iterations, Adam": means["256 4 0 Adam"]}
+    table = refinement_section(means, {"split": "test", "off": [0]}, 2)
+    rows = [line for line in table.splitlines() if line.startswith("| 4 of")]
+    assert rows[0] == "| 4 of 256 px | none | 0 | 22.00 | 18.75 | 15.00 | 0.100 | 22.00 | 18.75 |  |" and len(rows) == 3
+    assert rows[2] == "| 4 of 256 px | 4 iterations, Adam | 5 | 23.25 | 18.75 | 15.00 | 0.100 | 23.25 | 18.75 | 0.50 |"
+    for task in ("novel", "animation"):
+        for cell in means["256 4 0 Adam"].values():
+            cell[task]["lpips"] = 0.05
+    table = refinement_section(means, {"split": "test", "off": [2.5], "lpips_net": "alex"}, 2)
+    assert "LPIPS alex;" in table
+    assert "| 4 of 256 px | 0 mm | Adam | 5 | 23.25 | 18.75 | 0.050 | 15.00 | 0.100 | 23.25 | 18.75 | 0.050 | 0.50 |" in table
 
 
 TIMES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
