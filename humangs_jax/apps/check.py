@@ -1,8 +1,8 @@
 """A look at a capture before its use, and at a fit: the posed body over each photo, and numbers that show what is wrong.
 
 Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. A yellow
-line is the boundary of the body after its displacement to the masks, where `reconstruct` makes one. What is wrong with a view is
-said by `apps.quick_check`.
+line is the boundary of the body after the displacement of the capture, or after that to the masks where `reconstruct` makes one.
+What is wrong with a view is said by `apps.quick_check`.
 
 On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
 the cross of the body's landmark; where the body fits, disc and cross coincide. Below it: the error over time.
@@ -83,6 +83,8 @@ class CheckReport:
     warnings: tuple[str, ...] = ()
     displaced: float = 0.0
     """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits already."""
+    registered: bool = False
+    """Whether the capture itself says by how much."""
 
     @property
     def ok(self) -> bool:
@@ -98,7 +100,8 @@ class CheckReport:
             rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warnings))])
         lines = text_table(rows)
         if self.displaced:
-            lines.append(f"reconstruct will move the body to the masks, by up to {100 * self.displaced:.1f} cm (yellow)")
+            how = "as body.npz says" if self.registered else "to the masks"
+            lines.append(f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm (yellow)")
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
@@ -119,7 +122,9 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     vertices, tints = _posed_frames(capture), side_tints(capture.body)
-    moves = None if capture.masks is None else displacement(capture.body, capture, always=False)
+    moves = capture.displacement
+    if moves is None and capture.masks is not None:
+        moves = displacement(capture.body, capture, always=False)
     displaced = _posed_frames(capture, moves) if moves is not None and moves.any() else None
     overlays, views = [], []
     for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
@@ -136,7 +141,7 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
         views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     farthest = 0.0 if displaced is None or moves is None else float(np.linalg.norm(moves, axis=1).max())
-    return CheckReport(tuple(views), whole, farthest)
+    return CheckReport(tuple(views), whole, farthest, capture.displacement is not None)
 
 
 def draw_body(

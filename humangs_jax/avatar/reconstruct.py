@@ -25,6 +25,7 @@ from humangs_jax.data.views import (
     equal_exposure,
     fits,
     gaussian_body,
+    on_gaussian_body,
     pad_views,
     prepare_inputs,
     standardize,
@@ -57,8 +58,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     are left out. Numbers of views and of foreground tokens are rounded up to few sizes, each with a program of its own.
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
-    another world. Where the body sticks out of the masks, it is displaced to them first (`Runtime.displacement`). For a network
-    with a driver this is the avatar before any correction of a frame.
+    another world. The body is displaced first (`Runtime.displacement`): by the capture's displacement; without one, to the masks
+    where it sticks out of them. For a network with a driver this is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -230,14 +231,16 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
     """What the network gets of a capture; and whether its world has been turned."""
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
     views = upright(photos, capture.body)
-    if displaces(config) and capture.masks is not None:
+    if displaces(config) and capture.displacement is not None:
+        views = replace(views, displacement=on_gaussian_body(capture.displacement, capture.body, config))
+    elif displaces(config) and capture.masks is not None:
         moved = displacement(body, capture, always=config.runtime.displacement is True)
         views = replace(views, displacement=jnp.asarray(moved))
     return views, views.cameras is not photos.cameras
 
 
 def displaces(config: HumanGSConfig) -> bool:
-    """Whether the body may be displaced to the masks: if the network looks at the person's pixels alone."""
+    """Whether the body may be displaced: if the network looks at the person's pixels alone."""
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 
 
@@ -380,6 +383,7 @@ def _check(capture: Capture, name: str) -> None:
     shapes = {
         "images": (views, height, width, 3),
         "masks": None if capture.masks is None else (views, height, width),
+        "displacement": None if capture.displacement is None else capture.body.template.shape,
         "frames": (views,),
         "cameras.K": (views, 3, 3),
         "cameras.cam_from_world": (views, 4, 4),
@@ -397,6 +401,7 @@ def _check(capture: Capture, name: str) -> None:
         "images": (capture.images, UNIT),
         "masks": (capture.masks, UNIT),
         "betas": (capture.betas, FINITE),
+        "displacement": (capture.displacement, FINITE),
         "poses.rotations": (capture.poses.rotations, FINITE),
         "poses.translation": (capture.poses.translation, FINITE),
     }

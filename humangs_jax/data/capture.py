@@ -2,6 +2,7 @@
 
     me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [...]}
     me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations (m, j, 3), translations (m, 3)
+                          and perhaps displacement (n, 3)
     me/images/*.png ...   one photo per view, all of one size; masks likewise
 
 docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a `CaptureError`: one line that names
@@ -52,7 +53,7 @@ from humangs_jax.io.reading import FileError, check_limit, reading
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
-OPTIONAL_BODY_KEYS = {"shape_names"}
+OPTIONAL_BODY_KEYS = {"shape_names", "displacement"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -77,6 +78,9 @@ class Capture:
     """One per view, used as file names."""
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
+    displacement: Float[np.ndarray, "n 3"] | None = None
+    """Metres by which the vertices of the shaped body move in the T-pose, as another tool registered them (SMPL+D); joints stay.
+    It belongs to `betas`: who changes those leaves it out. None: `reconstruct` finds one by the masks."""
 
     __repr__ = short_repr
 
@@ -134,6 +138,7 @@ def capture_from_arrays(
     fit_masks: bool = False,
     body: BodyModel | None = None,
     body_file: str | Path = DEFAULT_BODY,
+    displacement: Any | None = None,
     source: str = "arrays",
 ) -> Capture:
     """A checked capture from arrays.
@@ -153,6 +158,7 @@ def capture_from_arrays(
         fit_masks: first move masks of photos that are too large or too small to the edges in the photos.
         body: the model. None: that of `body_file`.
         body_file: where the model comes from. Default: the shipped body.
+        displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
         source: what errors call the arrays.
 
     Returns:
@@ -177,7 +183,8 @@ def capture_from_arrays(
     cam_from_world = numbers(cam_from_world, source, "cam_from_world", (v, 4, 4))
     cameras = [checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}") for i in range(v)]
     body = _load_model(source, str(body_file)) if body is None else body
-    betas, rotations, translations = body_parameters(body, betas, rotations, translations, source, shape_names)
+    parameters = body_parameters(body, betas, rotations, translations, source, shape_names, displacement)
+    rotations = parameters[1]
     if frames is None:
         if len(rotations) > 1:
             raise CaptureError(source, "frames", f"expected a frame for each view, since there are {len(rotations)} poses")
@@ -192,7 +199,7 @@ def capture_from_arrays(
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
     photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
-    return _assemble(photos, body, betas, rotations, translations, body_file)
+    return _assemble(photos, body, body_file, *parameters)
 
 
 @checked_arguments
@@ -229,12 +236,13 @@ def load_capture(
         body_file, parameters = read_parameters(parameter_file)
         if body is None:
             body = _load_model(parameter_file, body_file, folder)
-        betas, rotations, translations = body_parameters(body, **parameters, file=parameter_file)
-        check_limit("frames", len(rotations), f"frames in {parameter_file}")
-        photos = read_photos(folder, description, views, len(rotations), fit_masks)
+        checked = body_parameters(body, **parameters, file=parameter_file)
+        frames = len(checked[1])
+        check_limit("frames", frames, f"frames in {parameter_file}")
+        photos = read_photos(folder, description, views, frames, fit_masks)
         if body_file != DEFAULT_BODY:
             body_file = str(folder / body_file)
-        return _assemble(photos, body, betas, rotations, translations, body_file)
+        return _assemble(photos, body, body_file, *checked)
 
 
 @checked_arguments
@@ -262,7 +270,13 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
 
 
 def _assemble(
-    photos: Photos, body: BodyModel, betas: np.ndarray, rotations: np.ndarray, translations: np.ndarray, body_file: str | Path
+    photos: Photos,
+    body: BodyModel,
+    body_file: str | Path,
+    betas: np.ndarray,
+    rotations: np.ndarray,
+    translations: np.ndarray,
+    displacement: np.ndarray | None,
 ) -> Capture:
     return Capture(
         **vars(photos),
@@ -270,6 +284,7 @@ def _assemble(
         betas=betas,
         poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
         body_file=str(body_file),
+        displacement=displacement,
     )
 
 
@@ -303,6 +318,7 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
         problem = f"expected the string {DEFAULT_BODY!r} or the path of a model file, got {name!r}"
         raise CaptureError(file, "body", problem)
     parameters: dict[str, Any] = {key: values[key] for key in ("betas", "rotations", "translations")}
+    parameters["displacement"] = values.get("displacement")
     if (names := values.get("shape_names")) is not None:
         if names.ndim != 1 or names.dtype.kind not in "US":
             raise CaptureError(file, "shape_names", f"expected one name for each of betas, got shape {names.shape}")
@@ -335,6 +351,7 @@ def _check_before_writing(capture: Capture) -> None:
         names=capture.names,
         background="white",
         body=capture.body,
+        displacement=capture.displacement,
         source="capture",
     )
 
@@ -355,10 +372,17 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
         view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()
         views.append(view)
     background = "photo" if capture.masks is None else "white"
-    poses = capture.poses
-    arrays = parameter_arrays(target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
-    write_npz(folder / "body.npz", arrays, compressed=False)
+    write_npz(folder / "body.npz", capture_parameters(target, capture), compressed=False)
     write_description(folder, views, background)
+
+
+def capture_parameters(folder: Path, capture: Capture) -> dict[str, np.ndarray]:
+    """The arrays of body.npz of a capture, see `parameter_arrays`."""
+    poses = capture.poses
+    arrays = parameter_arrays(folder, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
+    if capture.displacement is not None:
+        arrays["displacement"] = np.asarray(capture.displacement, np.float32)
+    return arrays
 
 
 def parameter_arrays(

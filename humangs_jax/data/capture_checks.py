@@ -19,9 +19,9 @@ COLOR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
 
 
-LARGEST_TURN, LARGEST_DISTANCE, LARGEST_BETA = 1e3, 1e4, 100.0
+LARGEST_TURN, LARGEST_DISTANCE, LARGEST_BETA, LARGEST_DISPLACEMENT = 1e3, 1e4, 100.0, 0.5
 """Radians of a rotation; metres from the origin (farther, float32 loses millimetres, and the numbers are no metres); shape
-coefficients, of which bodies that exist have less than 10."""
+coefficients, of which bodies that exist have less than 10; metres that clothes put between a body and its surface."""
 
 
 class CaptureError(FileError):
@@ -130,25 +130,37 @@ def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
 
 
 def body_parameters(
-    body: BodyModel, betas: Any, rotations: Any, translations: Any, file: object, shape_names: Sequence[str] | None = None
-) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """betas, rotations and translations in float32, of the sizes that the body has. shape_names: see `shape_coefficients`."""
+    body: BodyModel,
+    betas: Any,
+    rotations: Any,
+    translations: Any,
+    file: object,
+    shape_names: Sequence[str] | None = None,
+    displacement: Any | None = None,
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Float[np.ndarray, "n 3"] | None]:
+    """betas, rotations, translations and displacement in float32, of the sizes that the body has.
+
+    Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is none.
+    """
     joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
     if rotations.ndim != 3 or rotations.shape[1:] != (joints, 3) or len(rotations) == 0:
         raise CaptureError(file, "rotations", f"expected shape (frames, {joints}, 3) for this body, got {rotations.shape}")
     translations = numbers(translations, file, "translations", (len(rotations), 3))
     betas = numbers(betas, file, "betas")
+    if displacement is not None:
+        displacement = numbers(displacement, file, "displacement", body.template.shape)
     for field, array, largest in (
         ("rotations", rotations, LARGEST_TURN),
         ("translations", translations, LARGEST_DISTANCE),
         ("betas", betas, LARGEST_BETA),
+        ("displacement", displacement, LARGEST_DISPLACEMENT),
     ):
-        if (most := np.abs(array).max(initial=0)) > largest:
+        if array is not None and (most := np.abs(array).max(initial=0)) > largest:
             raise CaptureError(file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}")
     if betas.ndim != 1:
         raise CaptureError(file, "betas", f"expected a list of numbers, got shape {betas.shape}")
-    return shape_coefficients(body, betas, shape_names, file), rotations, translations
+    return shape_coefficients(body, betas, shape_names, file), rotations, translations, displacement
 
 
 def shape_coefficients(

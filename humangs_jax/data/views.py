@@ -146,6 +146,14 @@ def _remeshed(
     return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 
+def on_gaussian_body(displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig) -> Float[Array, "m 3"]:
+    """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move by the mean of the ends."""
+    carrier = replace(body, pose_directions=jnp.asarray(displacement)[..., None])  # linear, and no joint depends on them
+    carried = gaussian_body(carrier, config).pose_directions
+    assert carried is not None
+    return carried[..., 0]
+
+
 def subject_rest(body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None) -> RestBody:
     """The person's body in the T-pose; a displacement does not move the joints."""
     rest = shape_body(body, betas)

@@ -24,7 +24,7 @@ import numpy as np
 from humangs_jax.body.landmarks import usual_certainty
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
+from humangs_jax.data.capture import DEFAULT_BODY, Capture, capture_parameters, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError, few, numbers
 from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, Keypoints
 from humangs_jax.data.photos import capture_folder, read_description
@@ -144,8 +144,7 @@ def write_fitted(
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
     contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
-    name, poses = description["body"], capture.poses
-    arrays = parameter_arrays(target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation)
+    name, arrays = description["body"], capture_parameters(target, capture)
 
     def write_fit(folder: Path):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

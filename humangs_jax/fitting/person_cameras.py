@@ -415,4 +415,5 @@ def scaled_to_height(capture: Capture, height: float) -> Capture:
         betas=np.asarray(betas, np.float32),
         poses=replace(capture.poses, translation=roots - after.joints[0]),
         cameras=replace(capture.cameras, cam_from_world=matrices.at[:, :3, 3].multiply(scale)),
+        displacement=None if capture.displacement is None else scale * capture.displacement,
     )

@@ -158,10 +158,12 @@ def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
 
 
 def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
-    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images."""
+    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images; its displacement belonged to
+    the shape before, and is left out.
+    """
     (K, cam_from_world), betas, poses = _moved(with_cameras(origin, capture.cameras), state)
     cameras = replace(capture.cameras, K=K, cam_from_world=cam_from_world)
-    return dataclasses.replace(capture, cameras=cameras, betas=np.asarray(betas), poses=poses)
+    return dataclasses.replace(capture, cameras=cameras, betas=np.asarray(betas), poses=poses, displacement=None)
 
 
 @jax.jit
@@ -463,6 +465,8 @@ def _report(
             "moved: focal length x {focal_factor:.4f}, cameras {camera_degrees:.2f} degrees and {camera_cm:.1f} cm, "
             "joints {joint_degrees:.2f} degrees, person {transl_cm:.1f} cm (means)".format(**moved)
         )
+        if start.displacement is not None:
+            notes.append("the displacement of body.npz is left out: it was made for the shape before")
     warnings = []
     if after.iou is not None and after.iou < LEAST_IOU:
         warnings.append("body and masks do not agree: the start was too far off; `humangs check` shows why")

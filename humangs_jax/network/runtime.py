@@ -76,7 +76,8 @@ class Runtime:
         measured="benchmarks/quality.md",
     )
     """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that look at the pixels of the
-    "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right."""
+    "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right. False:
+    never; a capture's own displacement is left out, too, which else comes first."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
 

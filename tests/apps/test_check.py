@@ -145,6 +145,16 @@ def test_warnings_tell_what_is_wrong(tmp_path):
     assert all(view.outside < 0.01 for view in check_capture(right, tmp_path / "check.png").views)
 
 
+@pytest.mark.parametrize("masks", [True, False])
+def test_the_displacement_of_a_capture_is_drawn(tmp_path, masks):
+    moved = np.tile([0, 0.03, 0], (24, 1))
+    report = check_capture(capture(masks=masks, displacement=moved), tmp_path / "check.png")
+    assert "reconstruct will move the body as body.npz says, by up to 3.0 cm (yellow)" in str(report)
+    yellow = (np.abs(read_image(tmp_path / "check.png")[0] - module.DISPLACED) < 0.01).all(-1)
+    assert yellow.sum() > 3 * SIZE / 4
+    assert "yellow" not in str(check_capture(capture(displacement=0 * moved), tmp_path / "check.png"))
+
+
 def test_photos_are_shrunk_and_cameras_with_them(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "LONGEST_SIDE", SIZE // 2)
     report = check_capture(capture(), tmp_path / "check.png")

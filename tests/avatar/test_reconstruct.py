@@ -23,6 +23,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
 from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize, upright
@@ -32,6 +33,7 @@ from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.presets import tiny
 from humangs_jax.refinement.photos import crop_to_person
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 from humangs_jax.rendering.splatting import SplatConfig, render
 
 SIZE = 32
@@ -379,6 +381,60 @@ def test_masks_displace_the_body_if_the_network_looks_at_the_person_alone(body, 
     off = config.with_runtime(displacement=False)
     assert moved(photos, on.with_conventions(pixels="all")) is None and moved(photos, off) is None
     assert not moved(photos, config).any()  # no body sticks out of masks that are full
+
+
+def outward(photos):
+    """The capture with its body a centimetre thicker."""
+    rest = shape_body(photos.body, jnp.asarray(photos.betas))
+    normals = np.asarray(vertex_normals(rest.vertices, photos.body.faces))
+    return dataclasses.replace(photos, displacement=0.01 * normals)
+
+
+def test_the_displacement_of_a_capture_is_used_and_no_other(body, network):
+    config, photos = network[1].with_conventions(pixels="person"), outward(capture_of(body, 0, 2))
+    moved = lambda photos, config: _views(photos, gaussian_body(body, config), config)[0].displacement
+    for given in (photos, dataclasses.replace(photos, masks=None)):
+        np.testing.assert_array_equal(moved(given, config.with_runtime(displacement=True)), photos.displacement)
+    off = config.with_runtime(displacement=False)
+    assert moved(photos, config.with_conventions(pixels="all")) is None and moved(photos, off) is None
+    finer = config.with_conventions(longest_edge=0.05)
+    assert len(moved(photos, finer)) == len(gaussian_body(body, finer).template) > len(body.template)
+
+
+@pytest.mark.parametrize(("wrong", "expected"), [(np.zeros((7, 3)), r"shape \(500, 3\)"), (np.full((500, 3), np.nan), "finite")])
+def test_a_displacement_of_another_body_is_named(body, network, wrong, expected):
+    with pytest.raises(ValueError, match=f"displacement.*{expected}"):
+        reconstruct(*network, dataclasses.replace(capture_of(body, 0, 2), displacement=wrong))
+
+
+@pytest.mark.slow
+def test_a_kept_displacement_gives_the_avatar_of_one_that_is_computed(body, network):
+    variables, config = network[0], network[1].with_conventions(pixels="person").with_runtime(displacement=True)
+    photos = capture_of(body, 0, 2)
+    kept = dataclasses.replace(photos, displacement=displacement(body, photos))
+    assert kept.displacement.any()
+    computed, programs = reconstruct(variables, config, photos), _reconstruct._cache_size()
+    jax.tree.map(np.testing.assert_array_equal, reconstruct(variables, config, kept), computed)
+    assert _reconstruct._cache_size() == programs
+
+
+@pytest.mark.slow
+def test_a_known_displacement_moves_the_skin_and_no_joint_alone_and_in_a_batch(body, network):
+    variables, config = network[0], network[1].with_conventions(pixels="person", longest_edge=0.05)
+    bare = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
+    captures = [outward(bare[0]), dataclasses.replace(bare[1], masks=None)]  # with and without
+    still = dataclasses.replace(bare[0], displacement=0 * captures[0].displacement)  # whatever the masks say
+    before, after = (reconstruct(variables, config, photos) for photos in (still, captures[0]))
+    moved = np.asarray(after.rest_vertices - before.rest_vertices)
+    np.testing.assert_allclose(moved[: len(body.template)], captures[0].displacement, atol=1e-6)
+    assert len(moved) > len(body.template) and np.median(np.linalg.norm(moved, axis=1)) > 0.009  # midpoints, too
+    np.testing.assert_array_equal(after.rest_joints, before.rest_joints)
+    together = reconstruct_batch(variables, config, captures)
+    for avatar, photos in zip(together, captures, strict=True):
+        alone = reconstruct(variables, config, photos)
+        assert jax.tree.structure(avatar) == jax.tree.structure(alone)
+        of = lambda avatar: (avatar.rest_vertices, avatar.rest_joints, avatar.gaussians.means)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), of(avatar), of(alone))
 
 
 @pytest.mark.slow

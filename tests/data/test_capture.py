@@ -36,6 +36,7 @@ def arrays(seed=0):
         masks=random.random((VIEWS, HEIGHT, WIDTH)),
         frames=[0, 1, 1],
         body=tetrahedron(),
+        displacement=random.uniform(-0.5, 0.5, (4, 3)),
     )
 
 
@@ -53,7 +54,7 @@ def load(path):
 def assert_same(a, b, atol):
     np.testing.assert_allclose(a.images, b.images, atol=atol, rtol=0)
     np.testing.assert_allclose(a.masks, b.masks, atol=atol, rtol=0)
-    for field in ("frames", "betas"):
+    for field in ("frames", "betas", "displacement"):
         np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
     jax.tree.map(np.testing.assert_array_equal, (a.cameras, a.poses), (b.cameras, b.poses))
     assert a.names == b.names
@@ -66,9 +67,16 @@ def test_round_trip(tmp_path):
     assert_same(capture, once, HALF_LEVEL)
     save_capture(tmp_path / "b", once)
     assert_same(once, load(tmp_path / "b"), 0)  # a loaded capture is written back exactly
-    assert once.images.dtype == once.masks.dtype == once.betas.dtype == np.float32
+    assert once.images.dtype == once.masks.dtype == once.betas.dtype == once.displacement.dtype == np.float32
     assert once.poses.rotations.dtype == jnp.float32
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing temporary stays
+
+
+def test_a_body_without_displacement_has_none_in_its_file(tmp_path):
+    save_capture(tmp_path / "me", capture_from_arrays(**{**arrays(), "displacement": None}))
+    assert load(tmp_path / "me").displacement is None
+    with np.load(tmp_path / "me" / "body.npz") as file:
+        assert "displacement" not in file
 
 
 TOO_MANY = "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is 1,000,000,000"
@@ -109,6 +117,7 @@ def test_select_and_pose():
     np.testing.assert_array_equal(some.images, capture.images[[2, 0]])
     np.testing.assert_array_equal(some.cameras.cam_from_world[1], capture.cameras.cam_from_world[0])
     assert some.names == (capture.names[2], capture.names[0]) and list(some.frames) == [1, 0]
+    assert some.displacement is capture.resized(5).displacement is capture.displacement
     assert some.view_count == 2 and some.frame_count == capture.frame_count == FRAMES
     np.testing.assert_array_equal(capture.pose(1).rotations, capture.poses.rotations[1])
     assert capture.pose(1).translation.shape == (3,)
@@ -276,6 +285,13 @@ BAD = {
     "betas too long": (parameters(betas=np.ones(4)), "body.npz: betas", "has 3 such directions"),
     "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "a list of numbers, got shape (1, 3)"),
     "betas words": (parameters(betas=np.array(["a"])), "body.npz: betas", "numbers"),
+    "displacement count": (parameters(displacement=np.zeros((5, 3))), "body.npz: displacement", "(4, 3)"),
+    "displacement NaN": (parameters(displacement=with_nan((4, 3), (2, 1))), "body.npz: displacement", "[2, 1]"),
+    "displacement in millimetres": (
+        parameters(displacement=np.full((4, 3), -10.0)),
+        "body.npz: displacement",
+        "0.5 in magnitude",
+    ),
     "betas complex": (parameters(betas=np.zeros(2, complex)), "body.npz: betas", "numbers"),
 }
 
@@ -319,6 +335,7 @@ BAD_ARRAYS = {
     "names": (dict(names=["a", "a", "b"]), "names: expected 3 different names"),
     "name with slash": (dict(names=["a", "../b", "c"]), "names: expected letters"),
     "background": (dict(background="black"), "background: expected one of"),
+    "displacement": (dict(displacement=np.zeros((3, 4))), "displacement: expected shape (4, 3)"),
 }
 
 
@@ -398,6 +415,7 @@ def bad_captures():
         "frames[0]": spoiled(frames=np.full(VIEWS, 7)),
         "names": spoiled(names=("a", "b", "c/d")),
         "betas": spoiled(betas=np.ones(7, np.float32)),
+        "displacement": spoiled(displacement=np.ones((4, 3), np.float32)),
     }
 
 

@@ -110,11 +110,15 @@ def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted,
 @pytest.mark.slow
 def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path, monkeypatch):
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
-    capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
+    kept = np.full(fitted.capture.body.template.shape, 0.01, np.float32)
+    capture = dataclasses.replace(
+        fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved), displacement=kept
+    )
     target = check_place(folder[0], tmp_path / "out", overwrite=False)
     write_fitted(folder[0], target, capture, fitted.report)
     again = load_capture(target)
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
+    np.testing.assert_array_equal(again.displacement, kept)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
     with pytest.raises(ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "):

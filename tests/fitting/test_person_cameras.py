@@ -161,8 +161,10 @@ def test_a_person_of_another_height_looks_the_same():
         betas=np.zeros(body.shape_directions.shape[-1], np.float32),
         poses=jax.vmap(BodyPose)(jnp.zeros((1, len(body.parents), 3)), -rest.joints[:1] + jnp.asarray([0.1, 0.2, 0.0])),
         names=("a",),
+        displacement=np.full(body.template.shape, 0.01, np.float32),
     )
     tall = scaled_to_height(capture, 1.9)
+    np.testing.assert_allclose(tall.displacement, 0.01 * 1.9 / np.ptp(rest.vertices[:, 1]), rtol=1e-5)
 
     def of(capture):
         vertices = np.asarray(shape_body(body, jnp.asarray(capture.betas)).vertices + capture.poses.translation[0])

@@ -199,6 +199,14 @@ def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, ke
     assert bare is (kept or after == (0.20, 6.0))
 
 
+def test_a_displacement_of_the_shape_before_is_left_out():
+    start = dataclasses.replace(truth(), displacement=np.zeros(truth().body.template.shape, np.float32))
+    origin = module.capture_origin(start, start.cameras, CONFIG)
+    best, score = module.moved_capture(start, origin, start_state(origin, CONFIG)), Score(np.zeros(VIEWS), 0.9, None, 0.1)
+    told = [module._report(start, *pair, score, (), ()).notes for pair in ((best, score), (start, score))]
+    assert best.displacement is None and ["left out" in " ".join(notes) for notes in told] == [True, False]
+
+
 def test_settings_suit_what_is_known():
     alone, both, bare = usual_config(False), usual_config(True), usual_config(True, fixed_cameras=True, bare=True)
     assert vars(alone.std) == vars(CaptureRefineConfig().std)

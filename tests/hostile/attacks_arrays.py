@@ -201,7 +201,7 @@ def capture_of(key, value):
 
 
 for value in (1e38, 1e300, -1e20, 1e6):
-    for key in ("betas", "rotations", "translations"):
+    for key in ("betas", "rotations", "translations", "displacement"):
         case(f"{key} of {value:g}", "capture", capture_of(key, value))
 
 

@@ -102,6 +102,7 @@ def body_parameters():
         "betas": np.zeros(3, np.float32),
         "rotations": np.zeros((2, 5, 3), np.float32),
         "translations": np.zeros((2, 3), np.float32),
+        "displacement": np.zeros((4, 3), np.float32),
     }
 
 

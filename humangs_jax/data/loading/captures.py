@@ -60,7 +60,7 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     if not _same_body(name, folder, body_file):
         problem = f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected parameters of that"
         raise CaptureError(parameter_file, "body", problem)
-    betas, rotations, translations = body_parameters(body, **parameters, file=parameter_file)
+    betas, rotations, translations, _ = body_parameters(body, **parameters, file=parameter_file)  # bodies of training are bare
     views, size = description["views"], None
     check_photos(folder, views, together=False)
     for view in views:
