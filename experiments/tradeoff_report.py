@@ -76,7 +76,7 @@ ITERATIONS = (
 
 def refined(iterations: int, steps: int, size: int) -> Point:
     """A point with iterations, named by what it does."""
-    parts = [f"{iterations} round{'s' * (iterations > 1)}", *([f"{steps} steps"] if steps else [])]
+    parts = [f"{iterations} iteration{'s' * (iterations > 1)}", *([f"{steps} steps"] if steps else [])]
     name = ", ".join(parts) + (f" at {size}" if size != 256 else "")
     return point(name, "refinement", refine_iterations=iterations, refine_steps=steps, refine_size=size)
 
