@@ -13,6 +13,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import signal
 from pathlib import Path
 
 # before JAX is imported; the programs that tests start inherit it
@@ -21,6 +22,9 @@ if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.ve
     # the emitters make faster programs, but took more than a third of the CPU time of a run with an empty cache. XLA aborts at
     # flags that it does not know, and other versions of jaxlib may not have this one
     os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a shell; programs that tests interrupt inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
 import numpy as np

@@ -210,7 +210,7 @@ def test_written_training_people_are_training_people(first, count):
     """Every person written lies in the split that was asked for, or nothing is written."""
     written = []
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
-        patch.setattr(writer, "_work", lambda folder, seed, layout: written.append(seed))
+        patch.setattr(writer, "_write", lambda body, folder, seed, layout: written.append(seed))
         for split in ("train", "test"):
             written.clear()
             start = first % len(SPLITS[split])
