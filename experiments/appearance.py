@@ -17,9 +17,11 @@ from experiments.pictures import details, frontal_view, write_triples
 from experiments.refinement import with_body_off
 from experiments.results import markdown_table, write_json
 from experiments.subjects import TASKS, People, file_digest, make_evaluation_subject, shipped_digest, task_views
+from humangs_jax.avatar import reconstruct as reconstruction
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import tile
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
+from humangs_jax.data.skirt import find_hem
 from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.io.images import write_png
@@ -27,6 +29,7 @@ from humangs_jax.io.reading import read_json
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.weights import load_weights
+from humangs_jax.people.subject import describe
 from humangs_jax.refinement import learned
 from humangs_jax.refinement.config import HEAD_STEPS, ITERATIONS, RefineConfig
 from humangs_jax.refinement.learned import SHIPPED
@@ -196,6 +199,69 @@ def appearance_section(numbers: dict[str, Any], start: Any) -> str:
     header = ["photos", "body off", "views", "people", "avatar", *(heading for heading, _ in SHOWN.values())]
     about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
     return f"{about}\n\n{markdown_table(header, rows, 'lllll' + 'r' * len(SHOWN))}"
+
+
+# Skirts -------------------------------------------------------------------------------------------------------------------
+
+GARMENTS = ("skirt", "dress", "coat")
+"""Around both legs."""
+
+
+@entry
+def skirts(run: Run, people: People = People(80, held_out=6, pose_views=2), sheet: Path | None = None) -> None:
+    """People whose masks show a skirt, with it and without, from other cameras and in novel poses.
+
+    Needs the extra `lpips`.
+
+    Options:
+    sheet: two views of the pose of the photos and one of each other pose: truth, without and with the skirt, refined
+    """
+    start = people.start()
+    networks = {net: load_lpips(net) for net in NETS}
+
+    def measure(seed):
+        person = make_evaluation_subject(seed, start.body, (VIEWS,), start.size, start.held_out)
+        photos, truth, row = person.inputs(VIEWS), person.held_out, {}
+        worn = any(name in garment.kind for garment in describe(seed, start.body).garments for name in GARMENTS)
+        if find_hem(gaussian_body(photos.body, start.config), photos) is None:
+            return {"found": False, "worn": worn}, None
+        shown = []
+        for name, wanted in (("without", False), ("with", True)):
+            with mock.patch.object(reconstruction, "may_wear_skirt", lambda *_, wanted=wanted: wanted):
+                first = reconstruct(start.variables, start.config, photos)
+            for how, avatar in {
+                "feed-forward": first,
+                "refined": refine(first, photos, RefineConfig(steps=0, head_steps=0)),
+            }.items():
+                drawn = draw_views(avatar, truth)
+                for task, views in task_views(truth).items():
+                    images, alpha = drawn.images[views], np.asarray(drawn.alpha)[views]
+                    row[f"{task} {how} {name}"] = scores_of(images, alpha, truth.select(views), networks)
+            shown.append(drawn.images)
+        views = [next(iter(np.flatnonzero(np.asarray(truth.frames) == frame))) for frame in range(truth.frame_count)]
+        return row | {"found": True, "worn": worn}, [
+            np.concatenate([images[i] for i in (*views, 1)], axis=1) for images in (truth.images, *shown)
+        ]
+
+    cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
+    rows = list(run.rows(cases, start.settings, again=sheet is not None).values())
+    found = [row for row in rows if row["found"]]
+    scores = means([{key: cell for key, cell in row.items() if isinstance(cell, dict)} for row in found])
+    cell = lambda key: [f"{scores[key][name]:.{digits}f}" for name, (_, digits) in SHOWN.items()]
+    lines = [
+        [TASKS[task], how, name, *cell(f"{task} {how} {name}")]
+        for task, how, name in itertools.product(TASKS, ("feed-forward", "refined"), ("without", "with"))
+    ]
+    header = ["views", "avatar", "skirt", *(heading for heading, _ in SHOWN.values())]
+    wear = lambda rows: sum(row["worn"] for row in rows)
+    about = (
+        f"{len(found)} of {len(rows)} people of the {start.settings['split']} seeds: those whose masks show a skirt. "
+        f"{wear(rows)} of all wear a skirt, dress or coat, and {wear(found)} of these."
+    )
+    table = markdown_table(header, lines, "lll" + "r" * len(SHOWN))
+    run.show(f"{about}\n\n{table}", {"settings": start.settings, "means": scores})
+    if sheet:
+        write_triples(sheet, {seed: x for seed, x in run.pictures.items() if x}, 1, headers=("truth", "without", "with"))
 
 
 # The forward pass ---------------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """A look at a capture before its use, and at a fit: the posed body over each photo, and numbers that show what is wrong.
 
 Blue is the person's left side, red the right, the green line the boundary of the body; photo and body should coincide. A yellow
-line is the boundary of the body after the displacement of the capture, or after that to the masks where `reconstruct` makes one.
-What is wrong with a view is said by `apps.quick_check`.
+line is the boundary of the body after the displacement of the capture, or after that to the masks where `reconstruct` makes one,
+with its skirt. What is wrong with a view is said by `apps.quick_check`.
 
 On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
 the cross of the body's landmark; where the body fits, disc and cross coincide. Below it: the error over time.
@@ -31,6 +31,7 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD, displacement
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.masks import person_box
+from humangs_jax.data.skirt import with_skirt
 from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
@@ -85,6 +86,8 @@ class CheckReport:
     """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits already."""
     registered: bool = False
     """Whether the capture itself says by how much."""
+    skirt: bool = False
+    """Whether `reconstruct` puts a skirt around the legs."""
 
     @property
     def ok(self) -> bool:
@@ -102,6 +105,8 @@ class CheckReport:
         if self.displaced:
             how = "as body.npz says" if self.registered else "to the masks"
             lines.append(f"reconstruct will move the body {how}, by up to {100 * self.displaced:.1f} cm (yellow)")
+        if self.skirt:
+            lines.append("reconstruct will put a skirt around the legs, as the masks show one (yellow)")
         lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
@@ -122,10 +127,13 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     vertices, tints = _posed_frames(capture), side_tints(capture.body)
-    moves = capture.displacement
-    if moves is None and capture.masks is not None:
-        moves = displacement(capture.body, capture, always=False)
-    displaced = _posed_frames(capture, moves) if moves is not None and moves.any() else None
+    moves, worn = capture.displacement, None
+    if capture.masks is not None:
+        moves = displacement(capture.body, capture, always=False) if moves is None else moves
+        worn = with_skirt(capture.body, capture, moves)
+    body, moves = (capture.body, moves) if worn is None else worn
+    moves = None if moves is None or not moves.any() else moves
+    displaced = None if moves is None else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
     overlays, views = [], []
     for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
         drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
@@ -136,12 +144,12 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
                 warnings = (WIDER.format(outside, *(FIXED if right else FREE)),)
         overlays.append(overlay(capture.images[i], drawn))
         if displaced is not None:
-            moved = _body_image(displaced[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
+            moved = _body_image(displaced[int(capture.frames[i])], body.faces, side_tints(body), capture.cameras[i])
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    farthest = 0.0 if displaced is None or moves is None else float(np.linalg.norm(moves, axis=1).max())
-    return CheckReport(tuple(views), whole, farthest, capture.displacement is not None)
+    farthest = 0.0 if moves is None else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
+    return CheckReport(tuple(views), whole, farthest, capture.displacement is not None, worn is not None)
 
 
 def draw_body(

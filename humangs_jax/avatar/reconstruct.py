@@ -20,6 +20,7 @@ from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_argument
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.skirt import find_hem, with_skirt
 from humangs_jax.data.views import (
     SubjectViews,
     equal_exposure,
@@ -59,7 +60,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose directions would be those of
     another world. The body is displaced first (`Runtime.displacement`): by the capture's displacement; without one, to the masks
-    where it sticks out of them. For a network with a driver this is the avatar before any correction of a frame.
+    where it sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). For a network with a driver
+    this is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -79,6 +81,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     views, turned = _views(capture, body, config)
+    if may_wear_skirt(capture, config) and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
+        body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
@@ -92,7 +96,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
 def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
 
-    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people.
+    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the number of people. People in
+    skirts, whose bodies have more vertices, are reconstructed alone.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -109,6 +114,17 @@ def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Seq
     Examples:
         >>> avatars = hg.reconstruct_batch(*hg.load_weights(), captures)
     """
+    _check_all(captures)
+    body = gaussian_body(captures[0].body, config)
+    alone = [may_wear_skirt(capture, config) and find_hem(body, capture) is not None for capture in captures]
+    together = [capture for capture, apart in zip(captures, alone, strict=True) if not apart]
+    batch = iter(_together(variables, config, together) if together else ())
+    return [
+        reconstruct(variables, config, capture) if apart else next(batch) for capture, apart in zip(captures, alone, strict=True)
+    ]
+
+
+def _together(variables: Variables, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
     body, views, config, turned = _stacked(config, captures)
     avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
     return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(avatars, turned, strict=True)]
@@ -169,7 +185,7 @@ def _alone(variables: Variables, config: HumanGSConfig, capture: Capture) -> Ava
 
 @checked_arguments
 def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """What several people are reconstructed from in one program of your own.
+    """What several people are reconstructed from in one program of your own, without the skirts of `reconstruct`.
 
     Args:
         config: of the network.
@@ -188,6 +204,7 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
         >>> avatars, dropped = batched(variables, config, body, views)  # `reconstruct_batch`, as one batch
     """
+    _check_all(captures)
     body, views, config, turned = _stacked(config, captures)
     if config.conventions.light and any(turned):
         if not all(turned):
@@ -201,14 +218,6 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
 
 def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, SubjectViews, HumanGSConfig, list[bool]]:
     """Body, views, configuration; and whether each world has been turned."""
-    if not captures:
-        raise ValueError("captures: none given")
-    for index, capture in enumerate(captures):
-        if not isinstance(capture, Capture):
-            raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
-        _check(capture, f"captures[{index}]")
-        if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
-            raise ValueError(f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model")
     body = gaussian_body(captures[0].body, config)
     bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
     coefficients = max(len(capture.betas) for capture in captures)
@@ -227,6 +236,18 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
     return body, batch, fit_buffers(inputs, config), turned
 
 
+def _check_all(captures: Sequence) -> None:
+    """Raises: TypeError, ValueError unless these are captures of one body model that can be reconstructed."""
+    if not captures:
+        raise ValueError("captures: none given")
+    for index, capture in enumerate(captures):
+        if not isinstance(capture, Capture):
+            raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
+        _check(capture, f"captures[{index}]")
+        if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
+            raise ValueError(f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model")
+
+
 def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[SubjectViews, bool]:
     """What the network gets of a capture; and whether its world has been turned."""
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
@@ -242,6 +263,11 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
 def displaces(config: HumanGSConfig) -> bool:
     """Whether the body may be displaced: if the network looks at the person's pixels alone."""
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
+
+
+def may_wear_skirt(capture: Capture, config: HumanGSConfig) -> bool:
+    """Whether the body may get a skirt: if it may be displaced to masks."""
+    return displaces(config) and capture.masks is not None
 
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:

@@ -198,7 +198,20 @@ PerVertex = Float[np.ndarray, " n"]
 
 
 @dataclasses.dataclass(frozen=True)
-class _View:
+class Reach:
+    """How a surface moves to the edges of the masks: see `OUTWARDS`, `INWARDS`, `SMOOTHNESS` and `INSET`, whose values are those
+    of a body.
+    """
+
+    outwards: float = OUTWARDS
+    inwards: float = INWARDS
+    smoothness: float = SMOOTHNESS
+    inset: tuple[float, float] = INSET
+    iterations: int = ITERATIONS
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskedView:
     """One photo: the window around the person. coverage: by the person. project: (3, 4) to the window's pixels.
 
     linear, offset: from the rest pose to the posed body, for each vertex. low, high: x, y of the photo's corners.
@@ -237,9 +250,8 @@ def displacement(
     Where masks say nothing, or nothing of the body is near them, it is 0.
     """
     assert capture.masks is not None
-    betas = np.asarray(capture.betas, float)
-    rest = np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
-    views = _views(body, rest, capture)
+    rest = shaped(body, capture)
+    views = masked_views(body, rest, capture)
     total = np.zeros_like(rest)
     if not views:
         return total.astype(np.float32)
@@ -247,16 +259,33 @@ def displacement(
     held = HELD * np.asarray(body.skinning_weights) @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
     if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
         return total.astype(np.float32)
-    for _ in range(ITERATIONS):
-        moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
-        count, summed = _targets(views, moved, normals, faces, inset)
-        total += _spread(moved, faces, count, summed, held)[:, None] * normals
+    total += to_edges(views, rest, faces, held, Reach(inset=inset))
     moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
     total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
     return total.astype(np.float32)
 
 
-def _views(body: BodyModel, rest: Points, capture: Capture) -> list[_View]:
+def to_edges(views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: Reach) -> Points:
+    """How far the vertices of a surface in the T-pose move along its normals to the masks' edges, smoothly.
+
+    held: weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette.
+    """
+    total = np.zeros_like(rest)
+    for _ in range(reach.iterations):
+        moved, normals = rest + total, unit(vertex_crosses(rest + total, faces))
+        count, summed = _targets(views, moved, normals, faces, reach)
+        total += _spread(moved, faces, count, summed, held, reach)[:, None] * normals
+    return total
+
+
+def shaped(body: BodyModel, capture: Capture) -> Points:
+    """The vertices of the person's body in the T-pose."""
+    betas = np.asarray(capture.betas, float)
+    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
+
+
+def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
+    """Those of a capture with masks that show the person."""
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
     unusable = unusable_views(capture)
@@ -286,7 +315,7 @@ def _window(
     project: Float[np.ndarray, "3 4"],
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
-) -> _View:
+) -> MaskedView:
     """A view, cut to the person and brought to one size. Beyond the border of the photo the mask goes on as it ends there."""
     (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
     margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))
@@ -299,43 +328,41 @@ def _window(
     x, y = columns / window.shape[1], rows / window.shape[0]
     to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
     low, high = np.asarray([-left * x, -top * y]), np.asarray([(width - left) * x, (height - top) * y])
-    return _View(resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR)
+    return MaskedView(resized(window, columns, rows), to_window @ project, linear, offset, low + NEAR, high - NEAR)
 
 
-def _share_outside(views: list[_View], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]) -> float:
+def _share_outside(views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]) -> float:
     """Of the free vertices, those that are `OUTSIDE` outside of a mask; if few are outside at all, these."""
 
-    def share(outside: Callable[[_View, np.ndarray, np.ndarray], np.ndarray]) -> float:
+    def share(outside: Callable[[MaskedView, np.ndarray, np.ndarray], np.ndarray]) -> float:
         found = np.zeros(len(rest), bool)
         for view in views:
             pixels, per_metre, within = view.seen(rest)
             found |= within & outside(view, pixels, per_metre)
         return float(found[free].mean()) if free.any() else 0.0
 
-    few = share(lambda view, pixels, _: _at(view.coverage, pixels) < MASK_THRESHOLD)  # needs no distances
-    return few if few < MISFIT else share(lambda view, pixels, scale: _at(view.mask, pixels) < -OUTSIDE * scale)
+    few = share(lambda view, pixels, _: at(view.coverage, pixels) < MASK_THRESHOLD)  # needs no distances
+    return few if few < MISFIT else share(lambda view, pixels, scale: at(view.mask, pixels) < -OUTSIDE * scale)
 
 
-def _targets(
-    views: list[_View], rest: Points, normals: Points, faces: Faces, inset: tuple[float, float]
-) -> tuple[PerVertex, PerVertex]:
+def _targets(views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: Reach) -> tuple[PerVertex, PerVertex]:
     """For each vertex the number of photos that show it on the silhouette, and the sum of the distances to the masks' edges."""
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
-    reach = np.arange(-INWARDS, OUTWARDS + STEP / 2, STEP)
+    reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
     for view in views:
         pixels, per_metre, within = view.seen(rest)
-        own = signed_distance(_silhouette(pixels, faces, view.mask.shape)) - DRAWN
+        own = silhouette_distance(pixels, faces, view.mask.shape)
         probed, _, _ = view.seen(rest + PROBE * normals)
-        leaves = _at(own, probed) < _at(own, pixels) - LEAVES * PROBE * per_metre
-        edge = np.flatnonzero(within & (np.abs(_at(own, pixels)) < NEAR) & leaves)
+        leaves = at(own, probed) < at(own, pixels) - LEAVES * PROBE * per_metre
+        edge = np.flatnonzero(within & (np.abs(at(own, pixels)) < NEAR) & leaves)
         along = rest[edge, None] + reach[:, None] * normals[edge, None]
         pixels, _, within = view.seen(along, edge)
-        there, found = _crossing(np.where(within, _at(view.mask, pixels), np.nan), reach)
-        here, known = _crossing(_at(own, pixels), reach)
+        there, found = _crossing(np.where(within, at(view.mask, pixels), np.nan), reach)
+        here, known = _crossing(at(own, pixels), reach)
         found &= known
         count[edge[found]] += 1
         gap = (there - here)[found]
-        summed[edge[found]] += gap - np.clip(gap, *inset)
+        summed[edge[found]] += gap - np.clip(gap, *how.inset)
     return count, summed
 
 
@@ -360,7 +387,8 @@ def _crossing(
     return distance, found
 
 
-def _silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+def silhouette_distance(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+    """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""
     triangles = pixels[faces]
     a, b, c = np.moveaxis(triangles, 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
@@ -368,16 +396,16 @@ def _silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int
     pen = ImageDraw.Draw(image)
     for corners in (triangles[turn < 0] - 0.5).reshape(-1, 6).tolist():  # the side that faces the camera covers all
         pen.polygon(corners, fill=1)
-    return np.asarray(image, np.float32)
+    return signed_distance(np.asarray(image, np.float32)) - DRAWN
 
 
-def _spread(vertices: Points, faces: Faces, count: PerVertex, summed: PerVertex, held: PerVertex) -> PerVertex:
+def _spread(vertices: Points, faces: Faces, count: PerVertex, summed: PerVertex, held: PerVertex, reach: Reach) -> PerVertex:
     """The smooth displacement that is nearest to the targets."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
-    bending = SMOOTHNESS**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
+    bending = reach.smoothness**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
     matrix = sparse.diags(areas * (WEAKNESS + count + held)) + bending
-    return np.clip(splu(matrix.tocsc()).solve(areas * summed), -INWARDS, OUTWARDS)
+    return np.clip(splu(matrix.tocsc()).solve(areas * summed), -reach.inwards, reach.outwards)
 
 
 def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_matrix:
@@ -394,7 +422,7 @@ def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_
 
 
 def _outside(
-    views: list[_View],
+    views: list[MaskedView],
     rest: Points,
     normals: Points,
     faces: Faces,
@@ -406,7 +434,7 @@ def _outside(
     inside = np.full((len(rest), len(reach)), np.inf)
     for view in views:
         pixels, per_metre, within = view.seen(rest[:, None] - reach[:, None] * normals[:, None])
-        inside = np.minimum(inside, np.where(within, _at(view.mask, pixels) / per_metre, np.inf))
+        inside = np.minimum(inside, np.where(within, at(view.mask, pixels) / per_metre, np.inf))
     good = inside >= inset[0]
     move = np.where((inside[:, 0] < 0) & good.any(1) & free, reach[np.argmax(good, axis=1)], 0)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -420,7 +448,7 @@ def _outside(
     return move
 
 
-def _at(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
+def at(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
     """Bilinear; pixel centres at + 0.5."""
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
     return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)

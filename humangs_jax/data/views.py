@@ -309,10 +309,8 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
 
 # Which photos of many -------------------------------------------------------------------------------------------------
 
-SELECTION_SIZE = 128
-"""Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
-SELECTION_VERTICES = 2000
-"""Of the body that is looked at."""
+SELECTION_SIZE, SELECTION_VERTICES = 128, 2000
+"""Pixels a side of the depth maps, and vertices of the body: enough to know which side of it a photo shows."""
 LEAST_GAIN = 0.03
 """A further photo has to add this share to what the chosen ones show. Only where no number of photos is given."""
 
@@ -348,8 +346,7 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
     """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most; none after the first that
     raises it by less than the share `least`.
     """
-    chosen: list[int] = []
-    best = np.zeros(quality.shape[1])
+    chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
         sums = np.maximum(quality, best).sum(axis=1)
         sums[chosen] = -np.inf
@@ -390,10 +387,9 @@ EXPOSURE_SIZE = 256
 """Pixels a side of the crops around the person that are compared."""
 FACING, THICKNESS = 0.5, 0.02
 """Of a point that a photo shows: least cosine between normal and ray; metres by which it may lie behind the nearest surface."""
-INSIDE, BLUR = 5, 3
-"""Sides of squares of pixels: one that lies in the mask around each point, and one over which colors are averaged."""
-WHOLE = 0.99
-"""Least value of a mask in that square."""
+INSIDE, WHOLE, BLUR = 5, 0.99, 3
+"""Side of the square of pixels around each point that lies in the mask, least value of the mask in it; and side of the one over
+which colors are averaged."""
 USABLE = (0.06, 0.95)
 """Darker and brighter values say nothing about a gain."""
 LEAST_POINTS, ALIKE = 50, 50

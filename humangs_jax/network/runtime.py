@@ -72,12 +72,12 @@ class Runtime:
     displacement: bool | None = knob(
         None,
         cost="half a second where the body does not fit the masks, else 0.1 s",
-        gain="boundaries and hems of bodies that are a centimetre off",
+        gain="boundaries and hems of bodies that are a centimetre off, and skirts",
         measured="benchmarks/quality.md",
     )
     """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that look at the pixels of the
     "person". None: where a part of it sticks out of the masks; True: always, which costs PSNR where the body is right. False:
-    never; a capture's own displacement is left out, too, which else comes first."""
+    never; a capture's own displacement, which else comes first, and a skirt (`data.skirt`) are left out, too."""
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.avatar import reconstruct as reconstruction
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
@@ -23,6 +24,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
+from humangs_jax.data import skirt
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
@@ -435,6 +437,26 @@ def test_a_known_displacement_moves_the_skin_and_no_joint_alone_and_in_a_batch(b
         assert jax.tree.structure(avatar) == jax.tree.structure(alone)
         of = lambda avatar: (avatar.rest_vertices, avatar.rest_joints, avatar.gaussians.means)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), of(avatar), of(alone))
+
+
+@pytest.mark.slow
+def test_a_person_in_a_skirt_has_one_alone_and_among_others(body, network, monkeypatch):
+    variables, config = network[0], network[1].with_conventions(pixels="person")
+    skirted, plain = (dataclasses.replace(x, masks=np.ones_like(x.masks)) for x in (capture_of(body, i, 2) for i in (0, 1)))
+    shown = lambda _, capture: 0.6 if capture.images is skirted.images else None
+    monkeypatch.setattr(skirt, "find_hem", shown)
+    monkeypatch.setattr(reconstruction, "find_hem", shown)
+    worn, bare = (reconstruct(variables, config, x) for x in (skirted, plain))
+    added = skirt.ROWS * 2 * (skirt.GAP + skirt.HALF)
+    assert len(worn.rest_vertices) == len(bare.rest_vertices) + added == len(body.template) + added
+    per_vertex = config.architecture.decoder.gaussians_per_vertex
+    assert len(worn.gaussians.means) == per_vertex * len(worn.rest_vertices)
+    np.testing.assert_allclose(worn.rest_joints, shape_body(body, jnp.asarray(skirted.betas)).joints, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(worn.skinning_weights).sum(-1), 1, atol=1e-5)
+    for avatar, alone in zip(reconstruct_batch(variables, config, [skirted, plain]), (worn, bare), strict=True):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), avatar, alone)
+    off = reconstruct(variables, config.with_runtime(displacement=False), skirted)
+    assert len(off.rest_vertices) == len(body.template)
 
 
 @pytest.mark.slow

@@ -1,0 +1,222 @@
+"""A skirt: a tube of vertices around both legs, where the photos show cloth between them.
+
+Each leg of a body is a tube of its own, and no vertex spans the gap between them: on a body alone, a long skirt becomes a pair of
+ragged trousers. The vertices of the skirt are linear combinations of those of the legs, in shape, pose directions and skinning
+weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its rows lie on the convex section
+of both legs; from there it is displaced along its normals to the edges of the masks, as the body is (`data.body_and_masks`).
+
+The photos show a skirt where points between the legs, and beside both, lie inside the masks. It ends above the first row where
+they do not. Legs that no photo shows apart have no skirt. All on the host, by numpy and scipy.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.body_and_masks import (
+    MASK_THRESHOLD,
+    Points,
+    Reach,
+    at,
+    empty_views,
+    joint_moves,
+    masked_views,
+    shaped,
+    to_edges,
+)
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.mesh import vertex_areas
+
+LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))
+TRUNK = ("pelvis", "spine1")
+TOP, BOTTOM = 0.08, 0.97
+"""Where a skirt may begin and end: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above, the body is around both legs."""
+ROWS, GAP, HALF = 28, 11, 13
+"""Rows of a skirt; vertices of a row in each gap, and on the outer half of each leg. All skirts share one program."""
+BESIDE = 0.02
+"""Metres beside the legs: trousers reach as far."""
+SHOWN, VOTES = 0.8, 4
+"""A row is part of a skirt if this share of its points is inside the masks; rows with fewer points say nothing."""
+LEAST_ROWS, CLEAR, LONG_CLEAR = 4, 0.06, 0.1
+"""So many rows of a skirt at least are seen this far beside both legs, metres; the latter if no photo shows the legs apart below.
+Else it may be wide trousers, which look worse with a skirt."""
+REACH = Reach(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
+HELD = 1e4
+"""Weight of no displacement of the body, in the fit of the skirt."""
+
+
+def with_skirt(
+    body: BodyModel, capture: Capture, displacement: Float[np.ndarray, "n 3"]
+) -> tuple[BodyModel, Float[np.ndarray, "m 3"]] | None:
+    """The body with a skirt, and the displacement of both, metres; None where the photos show no skirt.
+
+    Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with masks. displacement: of the body.
+    """
+    hem = find_hem(body, capture) if body.texels is None else None  # a map of the surface has no place for it
+    if hem is None:
+        return None
+    worn, count = with_tube(body, hem), len(body.template)
+    rest, faces = shaped(worn, capture), np.asarray(worn.faces)
+    moved = np.concatenate([displacement, np.zeros((len(rest) - count, 3))])
+    held = np.where(np.arange(len(rest)) < count, HELD, 0.0)
+    moved[count:] = to_edges(masked_views(worn, rest, capture), rest + moved, faces, held, REACH)[count:]
+    sides = np.sqrt(vertex_areas(rest + moved, faces))
+    own = np.ones(count) if body.spacing is None else np.asarray(body.spacing)
+    spacing = np.concatenate([own, sides[count:] / np.median(sides[:count] / own)])
+    return replace(worn, spacing=jnp.asarray(spacing, body.template.dtype)), moved.astype(np.float32)
+
+
+def find_hem(body: BodyModel, capture: Capture) -> float | None:
+    """How far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None: they show none."""
+    legs = _legs(body)
+    if legs is None or capture.masks is None:
+        return None
+    levels, rest = np.linspace(TOP, BOTTOM, ROWS), shaped(body, capture)
+    joints = np.asarray(body.joint_regressor, float) @ rest
+    radii = _radii(body, rest, joints, legs, levels)
+    shares = np.arange(1, GAP + 1)[:, None] / (GAP + 1)
+    asked, shown, clear = np.zeros((3, ROWS))
+    cameras, empty = jax.tree.map(np.asarray, capture.cameras), empty_views(capture.masks)
+    rotations, translations = (np.asarray(x, float) for x in (capture.poses.rotations, capture.poses.translation))
+    for i in [i for i in range(capture.view_count) if i not in empty]:
+        moves = joint_moves(joints, body.parents, rotations[capture.frames[i]])
+        posed = np.einsum("jab,jb->ja", moves[..., :3], joints) + moves[..., 3] + translations[capture.frames[i]]
+        axes = _along(posed, legs, levels)
+        between = (1 - shares) * axes[0][:, None] + shares * axes[1][:, None]
+        project = cameras.K[i] @ cameras.cam_from_world[i, :3]
+        points, sides = (x.reshape(-1, 3) @ project[:, :3].T + project[:, 3] for x in (between, axes))
+        if min(points[:, 2].min(), sides[:, 2].min()) <= 0:
+            continue
+        pixels, centers = points[:, :2] / points[:, 2:], sides[:, :2] / sides[:, 2:]
+        focal = float(cameras.K[i, 0, 0])
+        distances = np.linalg.norm(pixels[:, None] - centers, axis=-1) - radii.ravel() * focal / sides[:, 2]
+        apart = distances.min(axis=1) * points[:, 2] / focal
+        height, width = capture.masks[i].shape
+        framed = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        beside = framed & (apart > BESIDE)
+        inside = beside & (at(np.asarray(capture.masks[i], float), pixels) > MASK_THRESHOLD)
+        asked += beside.reshape(ROWS, -1).sum(axis=1)
+        shown += inside.reshape(ROWS, -1).sum(axis=1)
+        clear = np.maximum(clear, np.where(inside, apart, 0).reshape(ROWS, -1).max(axis=1))
+    told = asked >= VOTES
+    skirt = told & (shown >= SHOWN * asked)
+    ends = np.flatnonzero(told & ~skirt)
+    rows = np.flatnonzero(skirt[: ends[0] if len(ends) else ROWS])
+    certain = clear[rows] > (CLEAR if len(ends) else LONG_CLEAR)
+    return float(levels[rows[-1]]) if np.count_nonzero(certain) >= LEAST_ROWS else None
+
+
+def with_tube(body: BodyModel, hem: float) -> BodyModel:
+    """The body, then the vertices of a tube around its legs down to `hem`. Raises: ValueError if it has no such legs."""
+    combined = _tube(body, np.linspace(TOP, hem, ROWS))
+    names = ("template", "shape_directions", "pose_directions", "skinning_weights")
+    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    for name, own in linear.items():
+        added = (combined @ own.reshape(len(own), -1)).reshape(-1, *own.shape[1:])
+        linear[name] = np.concatenate([own, added.astype(own.dtype)])
+    added, loop = combined.shape[0], 2 * (GAP + HALF)
+    upper = np.arange(added).reshape(ROWS, loop)[:-1]
+    following, lower = np.roll(upper, -1, axis=1), loop
+    corners = [(upper, following, upper + lower), (following, following + lower, upper + lower)]
+    tube = np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in corners])
+    return replace(
+        body,
+        **{name: jnp.asarray(x) for name, x in linear.items()},
+        faces=jnp.asarray(np.concatenate([np.asarray(body.faces), len(body.template) + tube]), body.faces.dtype),
+        joint_regressor=jnp.pad(body.joint_regressor, ((0, 0), (0, added))),  # joints stay
+        spacing=None if body.spacing is None else jnp.pad(body.spacing, (0, added), constant_values=1),
+        uvs=None,
+        uv_faces=None,
+        collapse_order=None,
+        collapse_into=None,
+    )
+
+
+def _legs(body: BodyModel) -> Int[np.ndarray, "2 3"] | None:
+    """Joints of legs that hang in the T-pose."""
+    names = list(body.joint_names)
+    if not all(name in names for leg in LEGS for name in leg):
+        return None
+    legs = np.asarray([[names.index(name) for name in leg] for leg in LEGS])
+    heights = (np.asarray(body.joint_regressor) @ np.asarray(body.template))[legs, 1]
+    return legs if (np.diff(heights) < 0).all() else None
+
+
+def _along(
+    joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "2 r 3"]:
+    """Points on the lines from hip to knee to ankle."""
+    return np.stack([np.stack([np.interp(levels, [0, 0.5, 1], joints[leg, i]) for i in range(3)], axis=1) for leg in legs])
+
+
+def _radii(
+    body: BodyModel, rest: Points, joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "2 r"]:
+    """Mean distance of the skin of each leg from these lines, metres."""
+    lines = _along(joints, legs, levels)
+    radii = np.zeros(lines.shape[:2])
+    for side, leg in enumerate(legs):
+        own = rest[np.asarray(body.skinning_weights)[:, leg].sum(axis=1) > 0.5]
+        row = np.abs(own[:, 1, None] - lines[side, :, 1]).argmin(axis=1)
+        distances = np.linalg.norm((own - lines[side, row])[:, [0, 2]], axis=1)
+        radii[side] = np.bincount(row, distances, ROWS) / np.maximum(np.bincount(row, minlength=ROWS), 1)
+    return radii
+
+
+def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
+    """Rows (r * loop, n) that make the vertices of a tube of those of the body.
+
+    A loop goes over the front from the left to the right, around the right leg, over the back, and around the left leg.
+    """
+    legs = _legs(body)
+    if legs is None:
+        raise ValueError(f"body: expected joints {LEGS}, each below the one before")
+    vertices, faces = np.asarray(body.template, float), np.asarray(body.faces)
+    joints = np.asarray(body.joint_regressor, float) @ vertices
+    names = [name for leg in LEGS for name in leg] + list(TRUNK)
+    own = np.asarray(body.skinning_weights)[:, [name in names for name in body.joint_names]].sum(axis=1) > 0.5
+    faces = faces[own[faces].all(axis=1)]  # no hands
+    turns = np.linspace(0, np.pi, HALF)
+    outwards = np.stack([np.sin(turns), 0 * turns, -np.cos(turns)], axis=1)  # of the left leg, from the back
+    shares = np.arange(1, GAP + 1) / (GAP + 1)
+    loops = []
+    for origins in np.moveaxis(_along(joints, legs, levels), 1, 0):
+        left, right = (_farthest(vertices, faces, origins[i], way * outwards) for i, way in enumerate((1.0, -1.0)))
+        gap = lambda a, b: sparse.csr_array((1 - shares)[:, None] * a + shares[:, None] * b)
+        loops += [gap(left[[-1]], right[[0]]), right, gap(right[[-1]], left[[0]]), left]
+    return sparse.vstack(loops, format="csr")
+
+
+def _farthest(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    origin: Float[np.ndarray, "3"],
+    rays: Float[np.ndarray, "r 3"],
+) -> sparse.csr_array:
+    """The last points (r, n) of a surface along horizontal rays, in barycentric coordinates (Moller and Trumbore 1997).
+
+    Raises: ValueError where a ray meets none.
+    """
+    heights = vertices[faces, 1]
+    faces = faces[(heights.min(axis=1) <= origin[1]) & (heights.max(axis=1) >= origin[1])]
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    u, v = b - a, c - a
+    across = np.cross(rays[:, None], v)
+    determinant = (across * u).sum(-1)
+    scale = 1 / np.where(np.abs(determinant) < 1e-15, np.inf, determinant)
+    start = origin - a
+    turned = np.cross(start, u)
+    beta, gamma = (across * start).sum(-1) * scale, rays @ turned.T * scale
+    distance = (turned * v).sum(-1) * scale
+    hit = (beta >= -1e-6) & (gamma >= -1e-6) & (beta + gamma <= 1 + 1e-6) & (distance > 0)
+    if not hit.any(axis=1).all():
+        raise ValueError("body: expected legs whose skin is around the lines from hip to knee to ankle")
+    rows = np.arange(len(rays))
+    face = np.argmax(np.where(hit, distance, -np.inf), axis=1)
+    beta, gamma = beta[rows, face], gamma[rows, face]
+    weights = np.stack([1 - beta - gamma, beta, gamma], axis=1)
+    return sparse.csr_array((weights.ravel(), (rows.repeat(3), faces[face].ravel())), (len(rays), len(vertices)))
