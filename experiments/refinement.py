@@ -175,7 +175,8 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
     about = (
         f"Means over {people} people of the {settings['split']} seeds; PSNR in dB"
         + (f"; LPIPS {settings['lpips_net']}" if settings.get("lpips_net") else "")
-        + "; worst-subject gain: the least of any person in novel views."
+        + "; seconds: of the whole run on one core, without compilation; silhouette: PSNR within 3 pixels (of 256) of the true "
+        + "one; worst-subject gain: the least of any person in novel views."
     )
     true = {
         name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]

@@ -297,7 +297,7 @@ def draw(rows: list[Row], key: str, path: Path) -> None:
             named = [row for row in points if row["knob"] == "preset" or row["name"] == "default"]
             for i, row in enumerate(sorted(named, key=lambda row: row[key])):
                 at, line = (row[key], row[task]["psnr"]), {"arrowstyle": "-", "lw": 0.6, "color": "0.4"}
-                place = (14, -26 - 18 * (i % 2))  # below the front, where there is room
+                place = (14, -26 - 26 * (i % 3))  # below the front, where there is room
                 axis.annotate(row["name"], at, place, fontsize=8, textcoords="offset points", arrowprops=line)
             label = f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default"
             axis.set(xscale="log", title=title, ylabel="PSNR, dB", xlabel=label)
