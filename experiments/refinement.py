@@ -138,7 +138,7 @@ def score_all(avatar: Any, held_out: Any, lpips: Lpips | None = None, view: int 
     scores = score_tasks(drawn.images, held_out, lpips, drawn.alpha)
     for task, views in task_views(held_out).items():
         if task in scores:
-            true = [float(semi_transparent(mask, mask)) for mask in held_out.masks[views]]
+            true = [float(semi_transparent(mask, mask)) for mask in jnp.asarray(held_out.masks)[views]]
             scores[task]["semi_transparent_of_truth"] = sum(true) / len(true)
     return scores, drawn.images[view]
 

@@ -93,7 +93,8 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
         options = options.with_people(Path(folder))
         given = options.weights + (train_first(options) if options.train else ())
         systems, networks = trained(options.runs, given), load_networks(options.lpips)
-        systems |= {f"{name}{SPLIT}": x for name, x in trained(None, options.split[1:]).items() if options.split}
+        if options.split:
+            systems |= {f"{name}{SPLIT}": x for name, x in trained(None, options.split[1:]).items()}
         settings, numbers = settings_of(options, given), {}
 
         def measure(name: str, people: Path | None, photos: int, varying: bool = False) -> dict[str, Any] | None:
