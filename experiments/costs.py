@@ -97,7 +97,10 @@ def _inner(given):
 def _message(equation, devices) -> Costs:
     name, given = equation.primitive.name, equation.params
     axes = given.get("axes", given.get("axis_name"))
-    size = math.prod(devices[axis] for axis in (axes if isinstance(axes, tuple) else (axes,)))
+    named = [axis for axis in (axes if isinstance(axes, tuple) else (axes,)) if not isinstance(axis, int)]
+    if not named:  # vmap has made it a sum over an axis of the array
+        return Costs()
+    size = math.prod(devices[axis] for axis in named)
     whole = sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars) * (size if name == "all_gather" else 1)
     share = 1 if name == "ppermute" else PASSES[name] * (size - 1) / size
     kind = name.removesuffix("_invariant")
