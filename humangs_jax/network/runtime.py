@@ -71,7 +71,7 @@ class Runtime:
     """Photos are cut to the square around the person's mask before they are brought to that size."""
     displacement: bool | None = knob(
         None,
-        cost="half a second where the body does not fit the masks, else 0.1 s",
+        cost="half a second where the body does not fit the masks, 1.2 s for a skirt, else 0.1 s",
         gain="boundaries and hems of bodies that are a centimetre off, and skirts",
         measured="benchmarks/quality.md",
     )
