@@ -150,7 +150,7 @@ def test_frames_without_views(good):
     chosen = dataclasses.replace(chosen, points=chosen.points[some], confidences=chosen.confidences[some])
     every = np.full((FRAMES, len(JOINT_NAMES)), 0.001)
     examination = examine(capture.select(some), chosen, joint_std=every, noise=np.ones(FRAMES))
-    assert np.isnan(examination.frames).tolist() == [False, True, False]
+    assert np.isnan(examination.frames).tolist() == [False, True, False, True]
     assert [view.frame for view in examination.report.views] == [0] * 4 + [2] * 4
     assert examination.report.ok and examination.report.undetermined == ()
 
@@ -316,7 +316,7 @@ def test_many_views_and_frames(tmp_path, monkeypatch):
     keypoints.confidences[26] = 0
     examination = examine(capture, keypoints)
     names = []
-    monkeypatch.setattr(module, "_label", lambda found, view: names.append(found.report.views[view].name) or "")
+    monkeypatch.setattr(module, "_fit_label", lambda found, view: names.append(found.report.views[view].name) or "")
     overlays = []
     monkeypatch.setattr(module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((SIDE, SIDE, 3)))
     fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")

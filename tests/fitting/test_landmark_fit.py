@@ -172,7 +172,7 @@ FEW_STEPS, SAME_PATH = 10, 1e-4
 
 @pytest.mark.slow
 def test_vmap_over_people_is_a_loop():
-    config = dataclasses.replace(CONFIG, steps=FEW_STEPS, person_steps=FEW_STEPS)
+    config = dataclasses.replace(CONFIG, person_steps=FEW_STEPS)
     several = [observe(NAMES[:2], seed=seed, noise=2.0)[2] for seed in range(2)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
     together = jax.vmap(lambda seen: fit_landmarks(model_of(), seen, config))(batch)
