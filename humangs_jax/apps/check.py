@@ -134,6 +134,7 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     body, moves = (capture.body, moves) if worn is None else worn
     moves = None if moves is None or not moves.any() else moves
     displaced = None if moves is None else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
+    moved_tints = side_tints(body)
     overlays, views = [], []
     for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
         drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
@@ -144,7 +145,7 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
                 warnings = (WIDER.format(outside, *(FIXED if right else FREE)),)
         overlays.append(overlay(capture.images[i], drawn))
         if displaced is not None:
-            moved = _body_image(displaced[int(capture.frames[i])], body.faces, side_tints(body), capture.cameras[i])
+            moved = _body_image(displaced[int(capture.frames[i])], body.faces, moved_tints, capture.cameras[i])
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])

@@ -42,8 +42,8 @@ BESIDE = 0.02
 SHOWN, VOTES = 0.8, 4
 """A row is part of a skirt if this share of its points is inside the masks; rows with fewer points say nothing."""
 LEAST_ROWS, CLEAR, LONG_CLEAR = 4, 0.06, 0.1
-"""So many rows of a skirt at least are seen this far beside both legs, metres; the latter if no photo shows the legs apart below.
-Else it may be wide trousers, which look worse with a skirt."""
+"""Wide trousers look worse with a skirt. To tell them apart, at least `LEAST_ROWS` rows must have a point inside the masks that
+is `CLEAR` metres beside both legs, or `LONG_CLEAR` where no photo shows the legs apart below the hem."""
 REACH = Reach(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight of no displacement of the body, in the fit of the skirt."""
@@ -98,7 +98,7 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
         height, width = capture.masks[i].shape
         framed = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         beside = framed & (apart > BESIDE)
-        inside = beside & (at(np.asarray(capture.masks[i], float), pixels) > MASK_THRESHOLD)
+        inside = beside & (at(capture.masks[i], pixels) > MASK_THRESHOLD)
         asked += beside.reshape(ROWS, -1).sum(axis=1)
         shown += inside.reshape(ROWS, -1).sum(axis=1)
         clear = np.maximum(clear, np.where(inside, apart, 0).reshape(ROWS, -1).max(axis=1))

@@ -42,8 +42,8 @@ HELD_OUT_PHOTOS = 4
 TRIAL = 1 / 3
 """Share of the steps that the trial makes."""
 ALLOWED_LOSS = 0.5
-"""Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when all photos are fitted. Of six
-validation people they lose up to 0.4 there, and gain 0.1 to 0.8 in other views by all photos."""
+"""Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when all photos are fitted. With
+six validation people they lose up to 0.4 there, and gain at least 0.1 in other views of that pose by all photos."""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
 """Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2 and gains 2.1 by all."""
 SUSPICIOUS = 1.5

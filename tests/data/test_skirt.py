@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.apps.check import check_capture
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
@@ -100,6 +101,12 @@ def test_a_skirt_is_found_and_lies_on_the_masks(body, hem, monkeypatch):
     x, z = own[low, 0] / (CONE[0] * grow), (own[low, 2] - depth) / (CONE[1] * grow)
     off = np.abs(np.hypot(x, z) - 1) * np.hypot(own[low, 0], own[low, 2] - depth)
     assert np.median(off) < SURFACE
+
+
+def test_check_says_that_there_is_a_skirt(body, tmp_path):
+    reports = [check_capture(in_clothes(body, worn=worn), tmp_path / "check.png") for worn in (None, cone(body, 0.7))]
+    assert [report.skirt for report in reports] == [False, True]
+    assert "skirt around the legs" in str(reports[1]) and "skirt" not in str(reports[0])
 
 
 @pytest.mark.parametrize(
