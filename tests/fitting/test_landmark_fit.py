@@ -171,7 +171,8 @@ FEW_STEPS, SAME_PATH = 10, 1e-4
 
 
 @pytest.mark.slow
-def test_vmap_over_people_is_a_loop():
+def test_vmap_over_people_is_a_loop(monkeypatch):
+    monkeypatch.setattr(landmark_fit, "STEPS", FEW_STEPS)
     config = dataclasses.replace(CONFIG, person_steps=FEW_STEPS)
     several = [observe(NAMES[:2], seed=seed, noise=2.0)[2] for seed in range(2)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
