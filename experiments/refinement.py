@@ -45,7 +45,6 @@ def refinement(
     views: tuple[int, ...] = (4,),
     iterations: tuple[int, ...] = (0, ITERATIONS),
     off: tuple[float, ...] = (0.0,),
-    refine_poses: bool = False,
     plot: Path | None = None,
     sheet: Path | None = None,
     details_sheet: Path | None = None,
@@ -61,18 +60,15 @@ def refinement(
     views: numbers of photos
     iterations: of the learned update; 0: Adam alone
     off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2 degrees, shapes change by 0.02
-    refine_poses: once more with all iterations, and the pose of each photo refined, too
     plot: PSNR against seconds
     sheet: truth, feed-forward and the longest run of every person, largest size
     details_sheet: the same of faces, hands, hems and shoes
     """
     start = people.start()
     settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "off": off}
-    settings |= {"iterations": iterations, "refine_poses": refine_poses}
+    settings |= {"iterations": iterations}
     settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
     hows = {f"{n} iterations, Adam" if n else "Adam": RefineConfig(iterations=n) for n in iterations}
-    if refine_poses:
-        hows["the same, poses too"] = RefineConfig(iterations=max(iterations), poses=True)
 
     def measure(seed):
         row, pictures = {}, None

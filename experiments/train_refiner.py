@@ -177,11 +177,10 @@ def read_sample(folder: Path) -> Sample:
     """What `make_samples` wrote."""
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
-    count = len(images)
     cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3])
     pose = jnp.asarray(arrays["rotations"]), jnp.asarray(arrays["translations"])
-    views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose, jnp.zeros(count, int)))
-    start = parameters_of(avatar.gaussians, 1, len(avatar.parents))
+    views = list(jax.vmap(Photo)(images, masks, jnp.ones(masks.shape, bool), cameras, *pose))
+    start = parameters_of(avatar.gaussians)
     return Sample(avatar, start, views, graph_of(np.asarray(avatar.gaussians.means)))
 
 
@@ -226,7 +225,7 @@ def view_loss(values: Any, like: Any, avatar: Any, view: Any, perceptual: Any, s
 
     perceptual: weight and network of LPIPS; None: without, and 0.
     """
-    drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.camera, splat)
+    drawn = render(posed_gaussians(unstacked(values, like), avatar, view), view.camera, splat)
     terms = {
         "squared": jnp.square(drawn.rgb - view.image),
         "absolute": jnp.abs(drawn.rgb - view.image),
@@ -345,7 +344,7 @@ def planned(samples: list[Sample]) -> Any:
     """Buffers that have room for every view of these samples."""
     like = SPLAT_PRESETS[samples[0].avatar.rendering]
     plans = [
-        plan_buffers(posed_gaussians(sample.start, sample.avatar, view, poses=False), view.camera, like, MARGIN)
+        plan_buffers(posed_gaussians(sample.start, sample.avatar, view), view.camera, like, MARGIN)
         for sample in samples
         for view in sample.views
     ]

@@ -215,8 +215,6 @@ class Refine:
     """Learned-optimizer iterations before the steps."""
     image_size: Side | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
-    refine_poses: bool = False
-    """Also refine the pose of each photo; it gains where bodies are more than millimetres off (docs: refinement)."""
     live: bool = False
     """Write the avatar so far to --out now and then, for `humangs view --live`."""
     fit_masks: bool = True
@@ -234,7 +232,7 @@ class Refine:
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
-        how = RefineConfig(iterations=self.iterations, image_size=self.image_size, poses=self.refine_poses, **limits)
+        how = RefineConfig(iterations=self.iterations, image_size=self.image_size, **limits)
         _refine_and_save(avatar, photos, self.out, how, self.live)
         suggest("humangs view", self.out)
 

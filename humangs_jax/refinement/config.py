@@ -41,10 +41,6 @@ class LearningRates:
     log_scales: Spread = 1e-2
     opacity_logits: Spread = 3e-2
     color_logits: Spread = 4e-2
-    rotations: Spread = 1e-3
-    """Radians of the pose's axis-angles; only with `RefineConfig.poses`."""
-    translations: Spread = 2e-4
-    """Metres, of the pose; only with `RefineConfig.poses`."""
 
 
 @configuration
@@ -82,8 +78,6 @@ class RefineConfig:
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     """A Gaussian whose largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what
     no photo shows stays."""
-    poses: bool = False
-    """Also refine the body pose of each photo. The corrected poses are not returned."""
     held_out: Share = 0.05
     """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no iteration and no
     step sees: the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole

@@ -76,7 +76,7 @@ def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: R
     with clock.compiling():
         photos, drawn = photos_of(crops.views), avatar.select(crops.drawn)
         drawn = with_low_pass_of(drawn, crops.views) if crops.finer else drawn
-        parameters = parameters_of(drawn.gaussians, len(photos.index), len(drawn.parents))
+        parameters = parameters_of(drawn.gaussians)
         share = jnp.asarray(np.asarray(trust)[crops.drawn] * crops.moved[crops.drawn])
         state = started(parameters, share, settings, crops.splat)
         state = replace(state, done=jnp.zeros((), jnp.int32), total=jnp.asarray(count), share=jnp.ones(()))
@@ -111,8 +111,8 @@ def _steps(state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, "
     """The state at step `stop`, one photo a step, in turns; its overflow is that of all steps."""
 
     def one(state: RefineState) -> RefineState:
-        photo = jax.tree.map(lambda x: x[state.done % len(photos.index)], photos)
-        image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat, config.poses)
+        photo = jax.tree.map(lambda x: x[state.done % len(photos.image)], photos)
+        image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
         gradient, _ = pulled(pull_back, jax.grad(head_loss)(image, photo, config))
         return update(replace(state, overflow=state.overflow + rendering.overflow), gradient, config)
 

@@ -28,8 +28,9 @@ from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensors import read_safetensors
-from humangs_jax.refinement.objective import Image, Parameters, compiled, drawn_photo, pulled
+from humangs_jax.refinement.objective import Image, compiled, drawn_photo, pulled
 from humangs_jax.refinement.photos import Photo
+from humangs_jax.rendering.gaussians import UnconstrainedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering
 
@@ -224,13 +225,13 @@ def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Ar
     return 3 * errors / (1 + jnp.abs(errors))
 
 
-def stacked(parameters: Parameters) -> Float[Array, "g 14"]:
+def stacked(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
     """The parameters of the Gaussians side by side."""
     return jnp.concatenate([getattr(parameters, name).reshape(len(parameters.means), -1) for name in FIELDS], axis=-1)
 
 
-def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
-    """Inverse of `stacked`; the poses are those of `like`."""
+def unstacked(values: Float[Array, "g 14"], like: UnconstrainedGaussians) -> UnconstrainedGaussians:
+    """Inverse of `stacked`, in the shapes of `like`."""
     shapes = {name: getattr(like, name) for name in FIELDS}
     ends = np.cumsum([x[0].size for x in shapes.values()])
     parts = jnp.split(values, ends[:-1], axis=-1)
@@ -238,21 +239,20 @@ def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
 
 
 def learned_update(
-    parameters: Parameters,
+    parameters: UnconstrainedGaussians,
     avatar: Avatar,
     photos: Sequence[Photo],
     graph: Graph,
     iterations: int,
     splat: SplatConfig,
-    poses: bool = False,
-) -> tuple[Parameters, Int[Array, ""]]:
+) -> tuple[UnconstrainedGaussians, Int[Array, ""]]:
     """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced; and the overflow."""
     start = values = stacked(parameters)
     hidden, overflow = jnp.zeros((len(values), Refiner.width)), jnp.zeros((), jnp.int32)
     used = min(len(photos), MOST_PHOTOS)
     chosen = [photos[i * len(photos) // used] for i in range(used)]
     for _ in range(iterations):
-        each = [photo_signals(parameters, avatar, photo, splat, poses) for photo in chosen]
+        each = [photo_signals(parameters, avatar, photo, splat) for photo in chosen]
         signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
         values, hidden = refiner_iteration(load_refiner(), values, start, hidden, signals, graph, avatar)
         parameters, overflow = unstacked(values, parameters), overflow + jnp.sum(missing)
@@ -260,10 +260,10 @@ def learned_update(
 
 
 def photo_signals(
-    parameters: Parameters, avatar: Avatar, photo: Photo, splat: SplatConfig, poses: bool = False
+    parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
     """Signals of one photo (without the axis v), from the pixels that count; and the overflow. splat: with `visibility`."""
-    image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses)
+    image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
     gradient, _ = pulled(pull_back, squared_errors(image, photo))
     foreground, _ = pulled(pull_back, foreground_errors(image, photo))
     _, pixels = pulled(pull_back, colors_alone(image))
@@ -292,7 +292,11 @@ def colors_alone(image: Image) -> Image:
 
 @compiled
 def signals_from(
-    gradient: Parameters, foreground: Parameters, pixels: Float[Array, " g"], rendering: Rendering, photo: Photo
+    gradient: UnconstrainedGaussians,
+    foreground: UnconstrainedGaussians,
+    pixels: Float[Array, " g"],
+    rendering: Rendering,
+    photo: Photo,
 ) -> Signals:
     """Signals from `squared_errors`, `foreground_errors` and `colors_alone`, each pulled back to the Gaussians."""
     assert rendering.visibility is not None

@@ -41,12 +41,12 @@ jax.tree_util.register_static(RefineConfig)  # here: its own module is imported 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: called with arrays, a program of its own; inside of a transformation, a part of that program.
 
-    Parameters named config, splat and poses are static.
+    Parameters named config and splat are static.
     """
 
     @functools.cache
     def program() -> Callable[P, T]:
-        static = [name for name in ("config", "splat", "poses") if name in inspect.signature(function).parameters]
+        static = [name for name in ("config", "splat") if name in inspect.signature(function).parameters]
         options = compiler_options()
         return jax.jit(function, static_argnames=static, compiler_options=options and options | FASTER_COMPILATION)
 
@@ -61,44 +61,24 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 # Parameters --------------------------------------------------------------------------------------------------------------
 
 
-@pytree_dataclass
-class Parameters:
-    """What refinement moves, each without bounds.
-
-    means: (g, 3) metres. quats: (g, 4). log_scales: (g, 3) of metres, no low-pass. opacity_logits: (g,). color_logits: (g, 3).
-    rotations: (v, j, 3) and translations: (v, 3), what is added to the pose of each photo.
-    """
-
-    means: Float[Array, "g 3"]
-    quats: Float[Array, "g 4"]
-    log_scales: Float[Array, "g 3"]
-    opacity_logits: Float[Array, " g"]
-    color_logits: Float[Array, "g 3"]
-    rotations: Float[Array, "v j 3"]
-    translations: Float[Array, "v 3"]
-
-
-PullBack = Callable[[Image], tuple[Parameters, Float[Array, " g"]]]
+PullBack = Callable[[Image], tuple[UnconstrainedGaussians, Float[Array, " g"]]]
 """From the gradient with respect to an image to those with respect to the parameters, and to the brightness of each Gaussian."""
 
 
-def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
-    """Inverse of `gaussians_of`, as far as `unconstrain` is one; poses unchanged. Raises: ValueError for harmonics."""
+def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
+    """What refinement moves: inverse of `gaussians_of`, as far as `unconstrain` is one. Raises: ValueError for harmonics."""
     if gaussians.harmonics is not None:
         raise ValueError("refine: gaussians.harmonics: expected none: colors that depend on the view are not refined")
-    free = unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
-    found = {name: x for name, x in vars(free).items() if x is not None}
-    return Parameters(**found, rotations=jnp.zeros((views, joints, 3)), translations=jnp.zeros((views, 3)))
+    return unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
 
 
-def gaussians_of(parameters: Parameters, low_pass: Float[Array, " g"] | None) -> Gaussians:
+def gaussians_of(parameters: UnconstrainedGaussians, low_pass: Float[Array, " g"] | None) -> Gaussians:
     """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
-    names = [field.name for field in dataclasses.fields(UnconstrainedGaussians) if hasattr(parameters, field.name)]
-    gaussians = constrain(UnconstrainedGaussians(**{name: getattr(parameters, name) for name in names}))
+    gaussians = constrain(parameters)
     return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
 
 
-def avatar_of(parameters: Parameters, avatar: Avatar) -> Avatar:
+def avatar_of(parameters: UnconstrainedGaussians, avatar: Avatar) -> Avatar:
     """The avatar with the Gaussians that the parameters stand for."""
     return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.low_pass))
 
@@ -106,26 +86,19 @@ def avatar_of(parameters: Parameters, avatar: Avatar) -> Avatar:
 # Images and their difference from the photos -----------------------------------------------------------------------------
 
 
-def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photo, poses: bool) -> Gaussians:
-    """The Gaussians in the pose of a photo, corrected as far as it has been refined.
-
-    poses: whether gradients reach the pose; they pass through the transforms of all Gaussians, which takes time.
-    """
-    turned, moved = parameters.rotations, parameters.translations
-    if not poses:
-        turned, moved = jax.lax.stop_gradient((turned, moved))
-    pose = BodyPose(photo.rotations + turned[photo.index], photo.translation + moved[photo.index])
-    return skin(avatar_of(parameters, avatar), pose)
+def posed_gaussians(parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo) -> Gaussians:
+    """The Gaussians in the pose of a photo."""
+    return skin(avatar_of(parameters, avatar), BodyPose(photo.rotations, photo.translation))
 
 
 @compiled
 def drawn_photo(
-    parameters: Parameters, avatar: Avatar, photo: Photo, splat: SplatConfig, poses: bool
+    parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Image, PullBack, Rendering]:
-    """The image of a photo, its pull-back, and all that was rendered. poses: see `posed_gaussians`."""
+    """The image of a photo, its pull-back, and all that was rendered."""
 
     def draw(parameters, brightness):
-        gaussians = posed_gaussians(parameters, avatar, photo, poses)
+        gaussians = posed_gaussians(parameters, avatar, photo)
         rendering = render(replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.camera, splat)
         return (rendering.rgb, rendering.alpha), rendering
 
@@ -133,7 +106,7 @@ def drawn_photo(
 
 
 @compiled
-def pulled(pull_back: PullBack, image: Image) -> tuple[Parameters, Float[Array, " g"]]:
+def pulled(pull_back: PullBack, image: Image) -> tuple[UnconstrainedGaussians, Float[Array, " g"]]:
     """`pull_back` of an image, as a program."""
     return pull_back(image)
 
@@ -183,10 +156,12 @@ class Comparison:
         return decibels(safe_divide(self.squared, self.pixels))
 
 
-def compare(parameters: Parameters, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig) -> Comparison:
+def compare(
+    parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, config: RefineConfig, splat: SplatConfig
+) -> Comparison:
     """Comparison with a photo."""
     splat = dataclasses.replace(splat, visibility=True)
-    image, _, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
+    image, _, rendering = drawn_photo(parameters, avatar, photo, splat)
     return compared(image, rendering, photo, config)
 
 

@@ -26,7 +26,7 @@ BLOCK = 8
 
 @pytree_dataclass
 class Photo(Batchable):
-    """A view to compare with, and which of its pixels count. index: its number, to which the changes of its pose belong."""
+    """A view to compare with, and which of its pixels count."""
 
     image: Float[Array, "h w 3"]
     mask: Float[Array, "h w"]
@@ -34,14 +34,12 @@ class Photo(Batchable):
     camera: Camera
     rotations: Float[Array, "j 3"]
     translation: Float[Array, "3"]
-    index: Int[Array, ""]
 
 
 def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"] | None = None) -> Photo:
     """The views of a person as a batch of photos. counted: None for all pixels."""
     counted = jnp.ones(views.masks.shape, bool) if counted is None else counted
-    index = jnp.arange(len(views.images))
-    leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index
+    leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations
     return jax.vmap(Photo)(*leaves)
 
 

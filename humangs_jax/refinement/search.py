@@ -10,7 +10,6 @@ With fewer photos, blocks of pixels are held out instead, and one search is made
 
 import contextlib
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import NamedTuple, TypeVar, cast
@@ -29,10 +28,11 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.learned import Graph, graph_of, learned_update
-from humangs_jax.refinement.objective import Comparison, Parameters, compare, parameters_of
+from humangs_jax.refinement.objective import Comparison, compare, parameters_of
 from humangs_jax.refinement.photos import Photo, held_out_blocks, photo_order, photos_of
 from humangs_jax.refinement.steps import RefineState, init_state, step
 from humangs_jax.rendering.buffers import plan_buffers
+from humangs_jax.rendering.gaussians import UnconstrainedGaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 
 T = TypeVar("T")
@@ -172,7 +172,7 @@ def prepare(avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Cl
     graph = graph_of(np.asarray(start.gaussians.means)) if config.iterations else None
     settings = dataclasses.replace(config, **HOST_SETTINGS)
     task = Task(start, fresh, photos, seen, graph, config, settings, clock)
-    parameters, splat = _parameters_of(start, len(photos)), planned(start, views)
+    parameters, splat = _parameters_of(start.gaussians), planned(start, views)
     each = comparison(task, parameters, photos, splat)
     state = init_state(parameters, each.together(), settings, splat)
     return task, Found(state, 0, np.arange(len(photos))), each
@@ -296,18 +296,18 @@ def iterated(task: Task, start: Found, used: Int[np.ndarray, " n"]) -> tuple[Fou
     return Found(state, task.config.iterations, used), float(found.loss)
 
 
-def updated(task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int) -> Parameters:
+def updated(task: Task, start: Found, used: Int[np.ndarray, " n"], iterations: int) -> UnconstrainedGaussians:
     """The parameters after iterations of the learned update on some photos."""
-    fresh, photos = _parameters_of(task.fresh, len(task.photos)), [task.seen[i] for i in used]
+    fresh, photos = _parameters_of(task.fresh.gaussians), [task.seen[i] for i in used]
 
-    def updated(splat: SplatConfig) -> tuple[Parameters, Array]:
+    def updated(splat: SplatConfig) -> tuple[UnconstrainedGaussians, Array]:
         assert task.graph is not None
-        return learned_update(fresh, task.avatar, photos, task.graph, iterations, splat, task.config.poses)
+        return learned_update(fresh, task.avatar, photos, task.graph, iterations, splat)
 
     return task.clock.with_room(updated, start.state.splat)
 
 
-def comparison(task: Task, parameters: Parameters, photos: Sequence[Photo], splat: SplatConfig) -> Comparison:
+def comparison(task: Task, parameters: UnconstrainedGaussians, photos: Sequence[Photo], splat: SplatConfig) -> Comparison:
     """Comparison with each of the photos (leading axis v)."""
 
     def compared(splat: SplatConfig) -> tuple[Comparison, Array]:
@@ -323,6 +323,4 @@ def psnr_of(task: Task, found: Found, photos: Sequence[Photo]) -> float:
     return float(comparison(task, found.state.parameters, photos, found.state.splat).together().psnr)
 
 
-@functools.partial(jax.jit, static_argnames="views")
-def _parameters_of(avatar: Avatar, views: int) -> Parameters:
-    return parameters_of(avatar.gaussians, views, len(avatar.parents))
+_parameters_of = jax.jit(parameters_of)

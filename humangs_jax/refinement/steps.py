@@ -18,7 +18,6 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.objective import (
     Comparison,
-    Parameters,
     avatar_of,
     compare,
     compiled,
@@ -28,6 +27,7 @@ from humangs_jax.refinement.objective import (
     pulled,
 )
 from humangs_jax.refinement.photos import Photo, photos_of
+from humangs_jax.rendering.gaussians import UnconstrainedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 
 PULLED = ("means", "log_scales")
@@ -54,8 +54,8 @@ class RefineState:
     total: steps. share: of the rates, in the whole run.
     """
 
-    parameters: Parameters
-    start: Parameters
+    parameters: UnconstrainedGaussians
+    start: UnconstrainedGaussians
     trust: Float[Array, " g"]
     moments: PyTree
     overflow: Int[Array, ""]
@@ -65,14 +65,16 @@ class RefineState:
     share: Float[Array, ""] | float = 1.0
 
 
-def init_state(parameters: Parameters, found: Comparison, config: RefineConfig, splat: SplatConfig) -> RefineState:
+def init_state(parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig) -> RefineState:
     """The state before the first step. found: comparison of the parameters with the photos; Gaussians that no photo shows get
     no trust.
     """
     return started(parameters, _trust(found.visibility, config), config, splat)
 
 
-def started(parameters: Parameters, trust: Float[Array, " g"], config: RefineConfig, splat: SplatConfig) -> RefineState:
+def started(
+    parameters: UnconstrainedGaussians, trust: Float[Array, " g"], config: RefineConfig, splat: SplatConfig
+) -> RefineState:
     """`init_state`, with a trust that is known."""
     moments = OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
     return RefineState(parameters, parameters, trust, moments, jnp.zeros((), jnp.int32), splat)
@@ -85,13 +87,13 @@ def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array,
 
 def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig) -> RefineState:
     """The state after one step on a photo. Where it overflows, it is not to be used: repeat it with larger buffers."""
-    image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat, config.poses)
+    image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
     gradient, _ = pulled(pull_back, loss_gradient(image, photo, config))
     return update(replace(state, overflow=rendering.overflow), gradient, config)
 
 
 @compiled
-def update(state: RefineState, gradient: Parameters, config: RefineConfig) -> RefineState:
+def update(state: RefineState, gradient: UnconstrainedGaussians, config: RefineConfig) -> RefineState:
     """The optimizer's step, with a rate for each parameter.
 
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
@@ -102,12 +104,10 @@ def update(state: RefineState, gradient: Parameters, config: RefineConfig) -> Re
     def moved(name: str) -> Array:
         value, step = getattr(state.parameters, name), getattr(steps, name)
         rate = state.share * cosine * getattr(config.rates, name)
-        if name in ("rotations", "translations"):
-            return value - rate * step if config.poses else value
         value = value - rate * state.trust.reshape(-1, *[1] * (value.ndim - 1)) * step
         return value - DECAY * (value - getattr(state.start, name)) if name in PULLED else value
 
-    parameters = Parameters(**{name: moved(name) for name in vars(state.parameters)})
+    parameters = replace(state.parameters, **{name: moved(name) for name in vars(config.rates)})
     return replace(state, parameters=parameters, moments=moments, done=state.done + 1)
 
 
@@ -121,7 +121,7 @@ def refine_views(
     the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
     avatar, photos = with_low_pass_of(avatar, views), photos_of(views)
-    parameters = parameters_of(avatar.gaussians, len(views.images), len(avatar.parents))
+    parameters = parameters_of(avatar.gaussians)
     found = jax.lax.map(lambda photo: compare(parameters, avatar, photo, config, splat), photos)
     state = replace(init_state(parameters, found.together(), config, splat), total=steps)
 
