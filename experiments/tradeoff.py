@@ -183,12 +183,16 @@ class Bench:
 
     # Avatars and their images ----------------------------------------------------------------------------------------
 
+    def photos(self, settings, i=0):
+        """As many photos of a person as settings take, or all."""
+        return self.person(i).inputs(settings.views or PHOTOS[-1])
+
     def made(self, point, i):
         """The avatar of a point; those that only differ in how they are drawn are made once."""
         settings = dataclasses.replace(point.settings, splat="as_trained", prune=False)
         key = (settings, point.start, i)
         if key not in self.kept:
-            photos = self.person(i).inputs(settings.views or 4)
+            photos = self.photos(settings, i)
             if point.start == "vertex-color baseline":
                 avatar = painted_body(photos)
             else:
@@ -231,7 +235,7 @@ class Bench:
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
-        return reconstruct_with(settings.unrefined, self.variables, self.config, self.person(0).inputs(settings.views or 4))
+        return reconstruct_with(settings.unrefined, self.variables, self.config, self.photos(settings))
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -257,7 +261,7 @@ class Bench:
 
     def refining(self, settings) -> tuple[float, float | None]:
         """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
-        photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
+        photos, avatar = self.photos(settings), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
         run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
         default = [self.default_make_ms() for _ in range(self.iterations)]

@@ -97,7 +97,6 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"views": 6, "crop": True, "refine_iterations": 4, "refine_size": 256},
     {"views": 6, "crop": True, "refine_iterations": 4, "refine_steps": 100, "refine_size": 256},
     {"views": 6, "crop": True, "refine_iterations": 4, "refine_size": 512},
-    {"views": 6, "crop": True, "refine_iterations": 4, "refine_steps": 100, "refine_size": 512},
     {"body_vertices": 1000, "crop": True, "refine_iterations": 4, "refine_size": 256, "splat": "fast"},
     {"crop": True, "image_size": 384, "refine_iterations": 4, "refine_size": 512},
     {"crop": True, "longest_edge": 0.02, "refine_iterations": 4, "refine_size": 256},
