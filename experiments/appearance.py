@@ -226,8 +226,8 @@ def skirts(run: Run, people: People = People(80, held_out=6, pose_views=2), shee
         if find_hem(gaussian_body(photos.body, start.config), photos) is None:
             return {"found": False, "worn": worn}, None
         shown = []
-        for name, wanted in (("without", False), ("with", True)):
-            with mock.patch.object(reconstruction, "may_wear_skirt", lambda *_, wanted=wanted: wanted):
+        for name, worn_by in (("without", lambda *_: None), ("with", reconstruction.with_skirt)):
+            with mock.patch.object(reconstruction, "with_skirt", worn_by):
                 first = reconstruct(start.variables, start.config, photos)
             for how, avatar in {
                 "feed-forward": first,

@@ -312,7 +312,8 @@ def with_room(cases):
     config, body = cases[0][1], gaussian_body(cases[0][2], cases[0][1])
     size = config.conventions.image_size
     examples = [Example(standardize(photos, size), standardize(targets, size)) for *_, photos, targets in cases]
-    fitted = [fit_buffers(prepare_inputs(body, example.inputs, config), config) for example in examples]
+    inputs = [prepare_inputs(body, example.inputs, config) for example in examples]
+    fitted = [fit_buffers(each.foreground, each.view_count, config) for each in inputs]
     config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
     return [(variables, config, body, example) for (variables, *_), example in zip(cases, examples, strict=True)]
 

@@ -170,7 +170,7 @@ def reconstructed(
     body = gaussian_body(inputs.body, config)
     views = standardize(equal_exposure(inputs), config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)
-    config = fit_buffers(prepared, config)
+    config = fit_buffers(prepared.foreground, prepared.view_count, config)
     return _outputs(variables, prepared, config), body, views, config
 
 

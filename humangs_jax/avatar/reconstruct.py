@@ -15,7 +15,7 @@ import numpy as np
 from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar, Light, light_coefficients, light_terms, log_brightness, turned_normals
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
@@ -31,7 +31,6 @@ from humangs_jax.data.views import (
     prepare_inputs,
     standardize,
     subject_rest,
-    upright,
 )
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
@@ -81,14 +80,14 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     views, turned = _views(capture, body, config)
-    if may_wear_skirt(capture, config) and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
+    if displaces(config) and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
         body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
     _check_posed(inputs.posed_vertices, "capture")
-    avatar, _ = _reconstruct(variables, fit_buffers(inputs, config), body, views, inputs)
+    avatar, _ = _reconstruct(variables, fit_buffers(inputs.foreground, inputs.view_count, config), body, views, inputs)
     return replace(avatar, light=None) if turned else avatar
 
 
@@ -116,7 +115,7 @@ def reconstruct_batch(variables: Variables, config: HumanGSConfig, captures: Seq
     """
     _check_all(captures)
     body = gaussian_body(captures[0].body, config)
-    alone = [may_wear_skirt(capture, config) and find_hem(body, capture) is not None for capture in captures]
+    alone = [displaces(config) and find_hem(body, capture) is not None for capture in captures]
     together = [capture for capture, apart in zip(captures, alone, strict=True) if not apart]
     batch = iter(_together(variables, config, together) if together else ())
     return [
@@ -233,7 +232,7 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
     _check_posed(inputs.posed_vertices, "captures")
-    return body, batch, fit_buffers(inputs, config), turned
+    return body, batch, fit_buffers(inputs.foreground, inputs.view_count, config), turned
 
 
 def _check_all(captures: Sequence) -> None:
@@ -251,7 +250,7 @@ def _check_all(captures: Sequence) -> None:
 def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[SubjectViews, bool]:
     """What the network gets of a capture; and whether its world has been turned."""
     photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
-    views = upright(photos, capture.body)
+    views = photos.upright(capture.body)
     if displaces(config) and capture.displacement is not None:
         views = replace(views, displacement=on_gaussian_body(capture.displacement, capture.body, config))
     elif displaces(config) and capture.masks is not None:
@@ -261,20 +260,15 @@ def _views(capture: Capture, body: BodyModel, config: HumanGSConfig) -> tuple[Su
 
 
 def displaces(config: HumanGSConfig) -> bool:
-    """Whether the body may be displaced: if the network looks at the person's pixels alone."""
+    """Whether the body may be displaced and get a skirt: if the network looks at the person's pixels alone."""
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 
 
-def may_wear_skirt(capture: Capture, config: HumanGSConfig) -> bool:
-    """Whether the body may get a skirt: if it may be displaced to masks."""
-    return displaces(config) and capture.masks is not None
-
-
-def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
-    """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
+def fit_buffers(foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, config: HumanGSConfig) -> HumanGSConfig:
+    """The configuration with room for the foreground of some inputs, those of one subject or of a batch."""
     patch, capacity = config.architecture.encoder.patch_size, 0
     if config.tokens != "all":
-        capacity = round_up(int(needed_tokens(inputs.foreground, inputs.view_count, patch)))
+        capacity = round_up(int(needed_tokens(foreground, view_count, patch)))
     return config.with_runtime(token_capacity=capacity)
 
 

@@ -66,6 +66,14 @@ class SubjectViews:
     depths: Float[Array, "v h w"] | None = None
     displacement: Float[Array, "n 3"] | None = None
 
+    def upright(self, body: BodyModel) -> "SubjectViews":
+        """The views in a world whose y axis points up; the same object if theirs does. See `upright_world`. On the host."""
+        pelvis = lambda: np.asarray(shape_body(body, self.betas).joints[0])
+        poses, cameras = upright_world(jax.vmap(BodyPose)(self.rotations, self.translations), self.cameras, pelvis)
+        if cameras is self.cameras:
+            return self
+        return replace(self, cameras=cameras, rotations=poses.rotations, translations=poses.translation)
+
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
     """The views, then ignored copies of the last one, so that subjects with fewer views can share a batch.
@@ -244,15 +252,6 @@ def _window(image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, 
     rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))
     window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[rows, columns]
     return window
-
-
-def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
-    """The views in a world whose y axis points up; the same object if theirs does. See `upright_world`. On the host."""
-    pelvis = lambda: np.asarray(shape_body(body, views.betas).joints[0])
-    poses, cameras = upright_world(jax.vmap(BodyPose)(views.rotations, views.translations), views.cameras, pelvis)
-    if cameras is views.cameras:
-        return views
-    return replace(views, cameras=cameras, rotations=poses.rotations, translations=poses.translation)
 
 
 def upright_world(poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]) -> tuple[BodyPose, Camera]:

@@ -11,7 +11,7 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.views import SubjectViews, upright
+from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
@@ -68,7 +68,7 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
     )
-    return upright(views, capture.body)
+    return views.upright(capture.body)
 
 
 def windows(

@@ -28,7 +28,7 @@ from humangs_jax.data import skirt
 from humangs_jax.data.body_and_masks import displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
-from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize, upright
+from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import HumanGSOutputs
@@ -176,8 +176,8 @@ def with_z_up(photos):
 def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     photos = capture(body, SIZE, SIZE)
     turned = with_z_up(photos)
-    own, views = standardize(photos, SIZE), upright(standardize(turned, SIZE), body)
-    assert upright(own, body) is own
+    own, views = standardize(photos, SIZE), standardize(turned, SIZE).upright(body)
+    assert own.upright(body) is own
     for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
         np.testing.assert_allclose(got, expected, atol=TURNED)
     avatars = [reconstruct(*network, x).gaussians for x in (photos, turned)]
@@ -226,7 +226,7 @@ def test_people_who_lie_before_upright_cameras_are_left_lying(body):
     """The person alone says nothing about the world; that of captures has y up."""
     views = standardize(capture(body, SIZE, SIZE), SIZE)
     lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
-    assert upright(lying, body) is lying
+    assert lying.upright(body) is lying
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
@@ -514,10 +514,10 @@ def test_views_and_bodies_of_another_configuration_are_refused(body, network):
 
 def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
     module = sys.modules[reconstruct_batch.__module__]
-    inputs = SimpleNamespace(posed_vertices=None)
+    inputs = SimpleNamespace(posed_vertices=None, foreground=None, view_count=None)
     monkeypatch.setattr(module, "_prepare_batch", lambda *_: inputs)
     monkeypatch.setattr(module, "_check_posed", lambda *_: None)
-    monkeypatch.setattr(module, "fit_buffers", lambda _, config: config)
+    monkeypatch.setattr(module, "fit_buffers", lambda *of: of[-1])
     photos, config = capture(body, SIZE, SIZE), network[1].with_conventions(light=True)
     turned = with_z_up(photos)
     with pytest.raises(ValueError, match=r"captures\[1\]: its world is not y-up, .*: stack them apart"):
