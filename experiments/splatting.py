@@ -157,8 +157,6 @@ KNOBS: dict[str, tuple[Any, ...]] = {
     "alpha_min": (1 / 128, 1 / 64, 1 / 32),
     "transmittance_stop": (1e-3, 1e-2, 1e-1),
     "radius_sigma": (3.0, 2.5, 2.0, 1.5),
-    "opacity_min": (0.1, 0.2, 0.4),
-    "scale": (0.75, 0.5),
 }
 SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "matmul_precision")
 """Knobs that do not change the image: left out of the plot."""

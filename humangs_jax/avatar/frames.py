@@ -409,9 +409,9 @@ def render_in_bands(
     transformations.
 
     Bands of one row of tiles may still need more: they get it. Configurations whose image depends on its height (a
-    `jacobian_margin`, a `scale`, `visibility`) are drawn whole. Raises: as `render`.
+    `jacobian_margin`, `visibility`) are drawn whole. Raises: as `render`.
     """
-    whole = config.jacobian_margin is not None or config.scale != 1 or config.visibility
+    whole = config.jacobian_margin is not None or config.visibility
     planned = plan_buffers(gaussians, camera, config, margin=1.0)
     rows, bands = -(-camera.height // config.tile_size), 1
     cameras = camera

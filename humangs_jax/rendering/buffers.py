@@ -15,7 +15,7 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.projection import drawn_camera, project_gaussians
+from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 
@@ -53,8 +53,7 @@ def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConf
     """`config`, with `default_pairs` if it leaves `max_pairs` open; for traced calls."""
     if config.max_pairs is not None:
         return config
-    drawn = drawn_camera(camera, config)
-    pairs = default_pairs(gaussians.means.shape[0], drawn.width, drawn.height, config.tile_size)
+    pairs = default_pairs(gaussians.means.shape[0], camera.width, camera.height, config.tile_size)
     return dataclasses.replace(config, max_pairs=pairs)
 
 
@@ -126,7 +125,6 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
 def _count(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> Sequence[Array]:
     def one(camera):
         projected = project_gaussians(gaussians, camera, config)
-        camera = drawn_camera(camera, config)
         footprints = footprints_by(projected, projected.dimmed(gaussians.opacities), config)
         grid = TileGrid(camera.width, camera.height, config.tile_size)
         return count_pairs(footprints, grid)

@@ -88,7 +88,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
     A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the half field of view beyond the
     border.
     """
-    gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
+    gaussians, camera = at_least_float32((gaussians, camera))
     eps2d, jacobian_margin = added_variance(gaussians.low_pass, config.eps2d), config.jacobian_margin
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -136,13 +136,6 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig 
         dimming=dimming,
         added_colors=colors,
     )
-
-
-def drawn_camera(camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> Camera:
-    """The camera of the image that is drawn: `config.scale` times the size, at least one pixel."""
-    if config.scale == 1:
-        return camera
-    return camera.resized(*(max(1, round(size * config.scale)) for size in (camera.width, camera.height)))
 
 
 def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:

@@ -62,7 +62,6 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
     if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
         contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / depths) ** 2, 1)
         opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
-    visible = visible & (opacities >= config.opacity_min)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)

@@ -69,8 +69,6 @@ class SplatConfig:
     """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat."""
     normalize_quats: bool = True
     """False: quaternions are not normalised, as in INRIA's rasterizer."""
-    opacity_min: Share = knob(0.0, cost="56 dB at 0.1, 40 dB at 0.4", gain="11 %, 18 % of the time", measured=MEASURED)
-    """Gaussians of lower opacity are not drawn at all."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
         None,
         cost="61 dB at 2.5, 52 dB at 2, 46 dB at 1.5; splats are cut at tile borders",
@@ -82,13 +80,6 @@ class SplatConfig:
     square: bool = False
     """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard deviation,
     rounded up to pixels, at tiles as INRIA counts them."""
-    scale: Annotated[float, Range(1e-3, 16)] = knob(
-        1.0,
-        cost="38 dB at 0.5",
-        gain="7 % of the time at 0.5, 18 % with gradients (not of projection and sorting)",
-        measured=MEASURED,
-    )
-    """The image is drawn at this fraction of its resolution, and resized (bilinear)."""
     visibility: bool = knob(
         False,
         cost="memory of one number a Gaussian",

@@ -36,7 +36,7 @@ from humangs_jax.rendering.buffers import (
 )
 from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
-from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
+from humangs_jax.rendering.projection import ProjectedGaussians, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import (
     Footprints,
@@ -313,10 +313,6 @@ def _draw(
     config: SplatConfig,
     others: Array | None = None,
 ) -> Rendering:
-    if config.scale != 1:
-        small = dataclasses.replace(config, scale=1.0)
-        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small, others)
-        return _resized(drawn, camera)
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     if gaussians.means.shape[0] == 0:
         blank = jnp.zeros((grid.tiles, 4 + (0 if others is None else others.shape[1]), grid.pixels), projected.x.dtype)
@@ -376,28 +372,3 @@ def _blended(
     rgb, alpha, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
     others = tiles_to_image(features[:, 4:], grid) if features.shape[1] > 4 else None
     return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility, others)
-
-
-def _resized(rendering: Rendering, camera: Camera) -> Rendering:
-    """The image at the camera's size; depth is weighted by alpha."""
-    r = rendering
-    premultiplied = [r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]]
-    premultiplied = jnp.concatenate([*premultiplied, *([] if r.features is None else [r.features])], axis=-1)
-    image = _resampled(_resampled(premultiplied, camera.height, 0), camera.width, 1)
-    alpha = image[..., 3]
-    others = None if r.features is None else image[..., 5:]
-    return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility, others)
-
-
-def _resampled(image: Array, size: int, axis: int) -> Array:
-    """Linear interpolation between pixels along one axis, constant beyond the outer ones.
-
-    As `jax.image.resize`, whose matrix products take 14 times as long on a CPU.
-    """
-    count = image.shape[axis]
-    at = ((np.arange(size) + 0.5) * (count / size) - 0.5).clip(0, count - 1)
-    first = np.floor(at).astype(np.int32)
-    fraction = np.expand_dims(at - first, [i for i in range(image.ndim) if i != axis]).astype(image.dtype)
-    neighbours = (jnp.asarray(i) for i in (first, np.minimum(first + 1, count - 1)))
-    a, b = (jnp.moveaxis(take(jnp.moveaxis(image, axis, 0), i), 0, axis) for i in neighbours)
-    return a + fraction * (b - a)

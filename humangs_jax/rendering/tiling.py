@@ -389,7 +389,6 @@ def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], 
 def footprints_by(projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig) -> Footprints | Squares:
     """The footprints that a configuration asks for: ellipses that end at `alpha_min` or `radius_sigma`, or squares."""
     reach = squared_reach(opacities, config.alpha_min)
-    reach = jnp.where(opacities >= config.opacity_min, reach, 0.0)
     if config.radius_sigma is None:
         return footprints(projected, reach)
     if config.square:

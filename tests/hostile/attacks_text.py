@@ -228,7 +228,6 @@ RUNS = {
     "optimizer.betas": ([2, 2], [-1, 0]),
     "splat.tile_size": (0, 10**9),
     "splat.chunk": (-1, 10**9),
-    "splat.scale": (0, 1e9),
     "model.conventions.image_size": (0, 10**6),
     "model.conventions.longest_edge": (1e-9,),
     f"{ENCODER}.transformer.width": (10**9,),

@@ -14,7 +14,7 @@ from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import _resampled, render, seen_from
+from humangs_jax.rendering.splatting import render, seen_from
 
 FLOAT64 = 1e-9
 """float64 rounding, relative to the largest entry."""
@@ -84,16 +84,6 @@ def test_seen_from_keeps_what_any_camera_sees():
 
 
 @pytest.mark.slow
-def test_opacity_min_drops_the_faint():
-    with jax.enable_x64(True):
-        gaussians = random_gaussians(5)
-        strong = few(gaussians, np.flatnonzero(np.asarray(gaussians.opacities) >= 0.3))
-        assert len(strong.means) < COUNT
-        dropped, expected = render(gaussians, camera(), knobs(opacity_min=0.3)), render(strong, camera(), SMALL)
-        np.testing.assert_allclose(dropped.rgb, expected.rgb, atol=FLOAT64)
-
-
-@pytest.mark.slow
 def test_extent_cuts_whole_tiles_only():
     with jax.enable_x64(True):
         gaussians = replace(random_gaussians(6), opacities=jnp.full(COUNT, 0.9))
@@ -105,30 +95,6 @@ def test_extent_cuts_whole_tiles_only():
         # at most the alpha of one splat beyond two deviations: no pixel here loses more
         assert 1e-3 < np.abs(narrow.rgb - exact.rgb).max() < 0.9 * np.exp(-2)
         assert plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs < plan_buffers(gaussians, view, SMALL).max_pairs
-
-
-@pytest.mark.slow
-def test_scale_draws_the_smaller_image():
-    with jax.enable_x64(True):
-        gaussians, view = random_gaussians(7), camera(width=2 * WIDTH, height=2 * HEIGHT)
-        half = render(gaussians, view.resized(WIDTH, HEIGHT), SMALL)
-        ours = render(gaussians, view, knobs(scale=0.5))
-        assert ours.rgb.shape == (2 * HEIGHT, 2 * WIDTH, 3) and ours.alpha.shape == ours.depth.shape
-        expected = jax.image.resize(half.rgb, ours.rgb.shape, "linear")
-        np.testing.assert_allclose(ours.rgb, expected, atol=FLOAT64)
-        seen = np.asarray(ours.alpha) > 0
-        low, high = half.depth[half.alpha > 0].min(), half.depth.max()
-        assert (ours.depth[seen] >= low - FLOAT64).all() and (ours.depth[seen] <= high + FLOAT64).all()
-        assert plan_buffers(gaussians, view, knobs(scale=0.5)).max_pairs <= plan_buffers(gaussians, view, SMALL).max_pairs
-
-
-@pytest.mark.parametrize(("size", "count"), [(7, 3), (8, 4), (5, 1)])
-def test_scaled_images_are_resized_linearly_about_pixel_centres(size, count):
-    image = jnp.asarray(np.random.default_rng(size).random((count, 3, 2)), jnp.float32)
-    expected = jax.image.resize(image, (size, 3, 2), "linear")
-    np.testing.assert_allclose(_resampled(image, size, 0), expected, atol=1e-6)
-    turned = _resampled(jnp.swapaxes(image, 0, 1), size, 1)
-    np.testing.assert_allclose(turned, jnp.swapaxes(expected, 0, 1), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -170,7 +136,7 @@ def test_one_plan_serves_an_animation():
 
 
 def test_settings_are_checked():
-    several = {"radius_sigma": 0.0, "square": True, "scale": 0.0, "chunk": 0, "alpha_min": 0.0, "alpha_max": 1.0, "near": -1.0}
+    several = {"radius_sigma": 0.0, "square": True, "chunk": 0, "alpha_min": 0.0, "alpha_max": 1.0, "near": -1.0}
     for wrong in ({name: value} for name, value in (several | {"max_pairs": 0}).items()):
         with pytest.raises(ValueError, match="SplatConfig"):
             SplatConfig(**wrong)

@@ -92,7 +92,7 @@ def test_equals_the_reference_with_all_gradients(seed, functions):
 
 
 def test_features_are_drawn_beside_the_colors():
-    """With gradients of all, as the reference has them; nothing else changes, however the image is resized."""
+    """With gradients of all, as the reference has them; nothing else changes."""
     rng = np.random.default_rng(4)
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(13), camera()
@@ -105,11 +105,10 @@ def test_features_are_drawn_beside_the_colors():
         found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=(2, 3))
         ours, expected = (found(gaussians, features, draw, CHUNKS) for draw in (render, render_reference))
         assert_close(ours, expected, FLOAT64)
-        half = dataclasses.replace(CHUNKS, scale=0.5)
-        plain, small = render(gaussians, view, half), render(gaussians, view, half, features=gaussians.colors)
-        np.testing.assert_array_equal(small.rgb, plain.rgb)
-        over = small.features + (1 - small.alpha[..., None])  # white
-        np.testing.assert_allclose(over, small.rgb, atol=FLOAT64)
+        plain, more = render(gaussians, view, CHUNKS), render(gaussians, view, CHUNKS, features=gaussians.colors)
+        np.testing.assert_array_equal(more.rgb, plain.rgb)
+        over = more.features + (1 - more.alpha[..., None])  # white
+        np.testing.assert_allclose(over, more.rgb, atol=FLOAT64)
     with pytest.raises(ValueError, match=r"features: expected shape \(32, n\), got \(31, 5\)"):
         render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
 
@@ -301,15 +300,13 @@ def test_lowers_for_every_platform(gradient, functions):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_the_two_halves_are_the_whole(scale):
+def test_the_two_halves_are_the_whole():
     gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
-    config = dataclasses.replace(CHUNKS, scale=scale)
 
     @jax.jit
     def halves(gaussians, view):
-        projected = project_gaussians(gaussians, view, config)
-        return draw_projected(projected, gaussians, view, config, background(np.float32))
+        projected = project_gaussians(gaussians, view, CHUNKS)
+        return draw_projected(projected, gaussians, view, CHUNKS, background(np.float32))
 
-    whole = jax.jit(lambda g, c: render(g, c, config, background(np.float32)))(gaussians, view)
+    whole = jax.jit(lambda g, c: render(g, c, CHUNKS, background(np.float32)))(gaussians, view)
     assert_close(halves(gaussians, view), whole, FLOAT32)
