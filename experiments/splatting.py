@@ -152,13 +152,11 @@ KNOBS: dict[str, tuple[Any, ...]] = {
     "tile_size": (4, 16),
     "block": (16, 64),
     "chunk": (4, 16),
-    "chunk_backward": (4, 16),
-    "matmul_precision": ("bfloat16",),
     "alpha_min": (1 / 128, 1 / 64, 1 / 32),
     "transmittance_stop": (1e-3, 1e-2, 1e-1),
     "radius_sigma": (3.0, 2.5, 2.0, 1.5),
 }
-SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "matmul_precision")
+SCHEDULE = ("tile_size", "block", "chunk")
 """Knobs that do not change the image: left out of the plot."""
 HIDDEN = (0.01, 0.03, 0.1)
 """Weights on any pixel of any camera below which a Gaussian is dropped (`splatting.seen_from`)."""

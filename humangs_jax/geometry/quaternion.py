@@ -60,12 +60,10 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def candidates_from_matrix(
-    m: Float[Array, "*b 3 3"], smallest: float = 0.1
-) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
+def candidates_from_matrix(m: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
     """The four quaternions that a rotation matrix can be read as, and how well conditioned each is.
 
-    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, `smallest`). Of a rotation
+    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of a rotation
     they are all the same; of another matrix they are not.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -84,7 +82,7 @@ def candidates_from_matrix(
         ],
         axis=-2,
     )
-    return candidates / (2 * jnp.maximum(q_abs, smallest))[..., None], q_abs
+    return candidates / (2 * jnp.maximum(q_abs, 0.1))[..., None], q_abs
 
 
 def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:

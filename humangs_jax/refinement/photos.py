@@ -36,9 +36,9 @@ class Photo(Batchable):
     translation: Float[Array, "3"]
 
 
-def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"] | None = None) -> Photo:
-    """The views of a person as a batch of photos. counted: None for all pixels."""
-    counted = jnp.ones(views.masks.shape, bool) if counted is None else counted
+def photos_of(views: SubjectViews) -> Photo:
+    """The views of a person as a batch of photos, all of whose pixels count."""
+    counted = jnp.ones(views.masks.shape, bool)
     leaves = views.images, views.masks, counted, views.cameras, views.rotations, views.translations
     return jax.vmap(Photo)(*leaves)
 

@@ -186,12 +186,8 @@ def moments_about_splat(moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y:
     return jnp.stack([*about, myy - 2 * y * my + y * y * m], axis=-1)
 
 
-def product(a: Float[Array, "*b m p"], b: Float[Array, "*b p n"], config: SplatConfig) -> Float[Array, "*b m n"]:
-    """Sums over pixels as a matrix product, with factors of `config.matmul_precision`."""
-    if config.matmul_precision == "float32":
-        return jnp.matmul(a, b, precision=EXACT)
-    narrow = a.astype(config.matmul_precision), b.astype(config.matmul_precision)
-    return jnp.matmul(*narrow, preferred_element_type=a.dtype)
+product = functools.partial(jnp.matmul, precision=EXACT)
+"""Sums over pixels as a matrix product."""
 
 
 # Small blocks of tiles, for CPUs -------------------------------------------------------------------------------------
@@ -272,7 +268,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
 
     They are those of e (1, dx, dy, dx^2, dx dy, dy^2), d from the splat's centre, and of w g.
     """
-    block, k, stop = config.block, config.chunk_backward, config.transmittance_stop
+    block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
     def backward(splats, items, starts, lengths, cotangents, totals):
@@ -305,8 +301,8 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
                     transmittance = after
                 weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
                 # matrix products: XLA's row reductions are slow on CPUs
-                moments = product(slopes.reshape(block * k, -1), powers, config).reshape(block, k, 6)
-                features = product(weights, jnp.moveaxis(g, 1, 2), config)
+                moments = product(slopes.reshape(block * k, -1), powers).reshape(block, k, 6)
+                features = product(weights, jnp.moveaxis(g, 1, 2))
                 rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
                 return i + 1, transmittance, seen, sums.at[item].add(rows, mode="drop")
 
@@ -436,8 +432,8 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., PyT
             slopes = (along * transmittance - behind / (1 - alpha)) * raw
             slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
 
-            moments = product(slopes.reshape(-1, p), powers, config).reshape(step, CHUNK, 6)
-            features = product(weights, jnp.moveaxis(g, 1, 2), config)
+            moments = product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
+            features = product(weights, jnp.moveaxis(g, 1, 2))
             rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
             tails = (_tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained)))
             return sums.at[item].add(rows, mode="drop"), *tails

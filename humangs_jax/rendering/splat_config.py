@@ -7,7 +7,7 @@ below `ALPHA_MIN`, so the image follows from the formula and not from a bounding
 """
 
 import dataclasses
-from typing import Annotated, Literal
+from typing import Annotated
 
 import jax
 
@@ -101,16 +101,10 @@ class SplatConfig:
         8, cost="none", gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time", measured=MEASURED
     )
     """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding)."""
-    block: Chunk = knob(32, cost="none", gain="within 4 % from 16 to 64 on CPUs", measured=MEASURED)
-    """Tiles that are composited together; on CPUs only."""
-    chunk: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
-    """Splats of a list taken at once; on CPUs only."""
-    chunk_backward: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
-    """Likewise with gradients."""
-    matmul_precision: Literal["float32", "bfloat16"] = knob(
-        "float32", cost="8e-4 of the gradient", gain="none on CPUs; meant for accelerators, not timed there", measured=MEASURED
-    )
-    """Of the gradient's sums over pixels: "bfloat16" rounds their factors to 8 bits."""
+    block: Chunk = 32
+    """Tiles that are composited together; on CPUs only. From 16 to 64 times differ by 4 %."""
+    chunk: Chunk = 8
+    """Splats of a list taken at once; on CPUs only. From 4 to 16 times differ by 6 %."""
 
     def __post_init__(self):
         if not self.alpha_min < self.alpha_max < 1:

@@ -124,7 +124,6 @@ def test_wrong_arguments_are_named(name):
         (Runtime(), {"attention": "flash"}, "Runtime: attention: expected one of 'auto', 'xla', "),
         (Runtime(), {"crop": "yes"}, "Runtime: crop: expected bool, got 'yes'"),
         (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
-        (hg.SplatConfig(), {"matmul_precision": "float16"}, "matmul_precision: expected one of 'float32', 'bfloat16'"),
         (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),
         (CONFIG.conventions, {"tokens": "front"}, "Conventions: tokens: expected one of 'all', 'foreground', got 'front'"),
         (CONFIG, {"runtime": "fast"}, "HumanGSConfig: runtime: expected Runtime, got 'fast'"),

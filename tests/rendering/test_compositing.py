@@ -16,7 +16,7 @@ EXACT = 1e-10
 
 GRID = TileGrid(12, 8, 4)  # six tiles
 LENGTHS = [4, 0, 5, 1, 0, 2]
-CONFIG = SplatConfig(tile_size=4, block=2, chunk=2, chunk_backward=3)
+CONFIG = SplatConfig(tile_size=4, block=2, chunk=2)
 
 
 pytestmark = pytest.mark.usefixtures("float64")

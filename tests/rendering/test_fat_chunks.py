@@ -67,7 +67,7 @@ def cotangents(grid, dtype):
 
 def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
     """Everything a schedule computes, for a random cotangent."""
-    config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, chunk_backward=4, visibility=True)
+    config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, visibility=True)
     forward, backward = functions
     with mock.patch.object(compositing, "STEP_CHUNKS", per_step):
         features, transmittance, lengths, peaks = forward(grid, config)(splats, *lists)
@@ -145,7 +145,7 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
 @pytest.mark.parametrize(("dtype", "seed"), [(np.float64, 0), (np.float32, 1), (np.float32, 2)])
 def test_equals_the_other_schedule_on_scenes(dtype, seed):
     with jax.enable_x64(dtype == np.float64):
-        config = SplatConfig(tile_size=8, block=4, chunk=4, chunk_backward=4)
+        config = SplatConfig(tile_size=8, block=4, chunk=4)
         splats, lists = from_scene(random_gaussians(seed, dtype, 6 * K), GRID, config)
         assert lists.counts.max() > 2 * K
         if dtype == np.float32:

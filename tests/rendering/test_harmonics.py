@@ -22,7 +22,7 @@ from humangs_jax.rendering.splatting import SplatConfig, render
 FLOAT64 = 1e-12
 FLOAT32 = 1e-4
 """Of gradients in float32, relative to their length."""
-CONFIG = SplatConfig(block=4, chunk=4, chunk_backward=3, max_pairs=2000)
+CONFIG = SplatConfig(block=4, chunk=4, max_pairs=2000)
 
 
 def directions(count=50):

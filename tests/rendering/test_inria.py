@@ -18,7 +18,7 @@ SAME = 1e-9
 """float64."""
 
 WIDTH, HEIGHT, TILE = 75, 53, 16
-INRIA = dataclasses.replace(SPLAT_PRESETS["inria"], block=4, chunk=4, chunk_backward=4)
+INRIA = dataclasses.replace(SPLAT_PRESETS["inria"], block=4, chunk=4)
 
 
 def test_drawing_as_weights_were_trained_keeps_the_other_knobs():

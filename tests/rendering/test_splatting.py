@@ -28,7 +28,7 @@ FLOAT64 = 1e-9
 FLOAT32, FLOAT32_GRADIENT = 1e-4, 5e-3
 """float32 against float64; gradients relative to the largest entry, Gaussians at the near plane included."""
 
-CHUNKS = SplatConfig(block=4, chunk=4, chunk_backward=3)
+CHUNKS = SplatConfig(block=4, chunk=4)
 """Several blocks, and several chunks of each, in a small image; also quick to compile."""
 
 VIEW = (HEIGHT, WIDTH)
