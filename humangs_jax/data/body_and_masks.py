@@ -389,14 +389,18 @@ def _crossing(
 
 def silhouette_distance(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
     """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""
-    triangles = pixels[faces]
-    a, b, c = np.moveaxis(triangles, 1, 0)
+    a, b, c = np.moveaxis(pixels[faces], 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    return signed_distance(silhouette(pixels, faces[turn < 0], shape)) - DRAWN  # the side that faces the camera covers all
+
+
+def silhouette(pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+    """1 where triangles lie, larger by `DRAWN` than they are."""
     image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
-    for corners in (triangles[turn < 0] - 0.5).reshape(-1, 6).tolist():  # the side that faces the camera covers all
+    for corners in (pixels[faces] - 0.5).reshape(-1, 6).tolist():
         pen.polygon(corners, fill=1)
-    return signed_distance(np.asarray(image, np.float32)) - DRAWN
+    return np.asarray(image, np.float32)
 
 
 def _spread(vertices: Points, faces: Faces, count: PerVertex, summed: PerVertex, held: PerVertex, reach: Reach) -> PerVertex:

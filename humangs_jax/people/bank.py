@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,6 +26,9 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.data.body_and_masks import displacement, silhouette
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import project
 from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import Refused, reading, write_json
@@ -42,6 +46,7 @@ from humangs_jax.people.subject import (
     spots_at,
 )
 from humangs_jax.people.surfaces import vertex_normals
+from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 
 # Baking ---------------------------------------------------------------------------------------------------------------
@@ -170,9 +175,11 @@ def _write_mesh(
 # Banks ----------------------------------------------------------------------------------------------------------------
 
 
-FORMAT, VERSION = "humangs-people", 1
+FORMAT, VERSION = "humangs-people", 2
 POSE_STREAM = 20
 """Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
+SILHOUETTES, SILHOUETTE_SIDE, SILHOUETTE_STREAM = 4, 960, 23
+"""Views that a body is displaced to, their pixels a side, and the stream of a seed that places their cameras."""
 UV_STEPS = 65535
 """Texture coordinates are stored in steps of one part of this."""
 PAD_VERTICES, PAD_FACES = 1024, 2048
@@ -191,6 +198,8 @@ class PeopleBank:
     alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
+    displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person (`data.body_and_masks`), metres;
+    b is 0 in a bank without.
     Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds; generator: `GENERATOR_VERSION`.
     """
 
@@ -211,6 +220,7 @@ class PeopleBank:
     texture: UInt8[Array, "p t t 6"]
     rotations: Float[Array, "p q j 3"]
     nearest: Int[Array, "p q"]
+    displacements: Float[Array, "p b 3"]
     parents: tuple[int, ...] = static_field(default=())
     mirrored_joints: tuple[int, ...] = static_field(default=())
     split: str = static_field(default="")
@@ -229,12 +239,14 @@ def build_bank(
     *,
     texture_size: int = 512,
     pose_count: int = 16,
+    displaced: BodyModel | None = None,
     processes: int = 1,
     progress: bool = False,
 ) -> PeopleBank:
     """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
 
     texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
+    displaced: the body to displace, one of `data.views.gaussian_body`; None: none.
     processes: how many work at once; more than one use the CPU and load the shipped body themselves.
     Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
     """
@@ -242,7 +254,7 @@ def build_bank(
     if not seeds:
         raise ValueError("no seeds")
     _check_range(seeds, split)
-    make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
+    make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count, displaced=displaced)
     if processes == 1:
         made = ((i, make(seed, body)) for i, seed in enumerate(seeds))
     else:
@@ -308,7 +320,9 @@ def _shipped_body() -> BodyModel:
     return load_body()
 
 
-def _person(seed: int, body: BodyModel | None = None, *, texture_size: int, pose_count: int) -> dict[str, np.ndarray]:
+def _person(
+    seed: int, body: BodyModel | None = None, *, texture_size: int, pose_count: int, displaced: BodyModel | None
+) -> dict[str, np.ndarray]:
     """One subject's share of the bank, unpadded: name -> array."""
     subject = make_subject(seed, _shipped_body() if body is None else body)
     baked = bake_subject(subject, texture_size, 2 if texture_size <= 512 else 1)  # fine patterns on coarse texels
@@ -341,7 +355,21 @@ def _person(seed: int, body: BodyModel | None = None, *, texture_size: int, pose
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
+        "displacements": np.zeros((0, 3), np.float16) if displaced is None else to_silhouettes(subject, displaced, rotations[0]),
     }
+
+
+def to_silhouettes(subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "b 3"]:
+    """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a pose, metres."""
+    rng, nowhere = np.random.default_rng([subject.seed, SILHOUETTE_STREAM]), np.zeros(3, np.float32)
+    vertices = subject.posed_vertices(rotations, nowhere)
+    cameras = cameras_around(rng, vertices, spread_azimuths(rng, SILHOUETTES), SILHOUETTE_SIDE)
+    pixels = np.asarray(jax.vmap(project, in_axes=(0, None))(cameras, jnp.asarray(vertices, jnp.float32))[0])
+    masks = np.stack([silhouette(view, subject.surface.faces, (SILHOUETTE_SIDE, SILHOUETTE_SIDE)) for view in pixels])
+    frames, names = np.zeros(SILHOUETTES, int), tuple(map(str, range(SILHOUETTES)))
+    poses = jax.tree.map(lambda x: x[None], BodyPose(jnp.asarray(rotations), jnp.asarray(nowhere)))
+    images = np.broadcast_to(masks[..., None], (*masks.shape, 3))
+    return displacement(body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)).astype(np.float16)
 
 
 _BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")

@@ -40,6 +40,8 @@ from humangs_jax.rendering.tiling import cumsum
 
 MIXING = 0.5
 """Largest share of the way to the nearest pose; the other half of the way is reached from that pose."""
+DISPLACED, COUNTED = 1, 2
+"""They make the keys that decide whether the body is displaced and how many views there are from that of an example."""
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
 """Of views: numbers for cameras, azimuths, poses, shares of close cameras."""
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
@@ -50,6 +52,9 @@ class OnTheFlyConfig:
     """What an example shows."""
 
     input_views: Few = 4
+    view_counts: tuple[Few, ...] = ()
+    """If given, how many of the `input_views` an example has, one of these at random. The last one is repeated after them, so
+    that one program serves all numbers (`SubjectViews.view_count`)."""
     target_views: Few = 3
     input_size: Side = 256
     """Pixels a side."""
@@ -69,6 +74,8 @@ class OnTheFlyConfig:
     """Of examples."""
     dyed_share: Share = 0.7
     """Of examples."""
+    displaced_share: Share = 0.0
+    """Of examples: their body is displaced to the silhouettes of the clothes, and they are not mirrored."""
     supersampling: Annotated[int, Range(1, 16)] = 2
     """Samples a side of each pixel."""
     depths: bool = False
@@ -104,7 +111,11 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
     """Views of a person of the bank: inputs and targets."""
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
-    plans = _plans(numbers, config)
+    count = None
+    if config.view_counts:
+        number = jax.random.uniform(jax.random.fold_in(key, COUNTED))
+        count = jnp.asarray(config.view_counts, jnp.int32)[pick(number, len(config.view_counts))]
+    plans = _plans(numbers, config, count)
     if config.input_size == config.target_size:  # one loop over all views: half of the compilation
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
         views = _views(bank, scene, both, config, config.input_size)
@@ -113,8 +124,15 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
         sizes = config.input_size, config.target_size
         parts = [_views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)]
     flipped = numbers["mirrored"] < config.mirrored_share
+    if config.displaced_share:
+        displaced = jax.random.uniform(jax.random.fold_in(key, DISPLACED)) < config.displaced_share
+        flipped &= ~displaced
     choose = lambda a, b: jnp.where(flipped, a, b)
-    return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
+    inputs, targets = (jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts)
+    if config.displaced_share:
+        moved = bank.displacements[scene.person].astype(inputs.images.dtype)
+        inputs = replace(inputs, displacement=jnp.where(displaced, moved, 0))
+    return Example(replace(inputs, view_count=count), targets)
 
 
 def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[str, Float[Array, "..."]]:
@@ -168,14 +186,19 @@ def pose_person(
     return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
 
 
-def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig) -> tuple[Plan, Plan]:
-    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,)."""
-    azimuths = surroundings.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
+def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None) -> tuple[Plan, Plan]:
+    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,).
+
+    count: of the inputs; after them the last one is repeated. None: all.
+    """
+    azimuths = surroundings.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share, count)
     own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
     anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
     close = jnp.full(config.target_views, config.close_share)
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
+    if count is not None:
+        inputs = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(config.input_views), count - 1)], inputs)
     return inputs, (numbers["target_cameras"], anywhere, other, close)
 
 

@@ -150,14 +150,17 @@ def _along_axes(points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar)
     return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
 
 
-def azimuths_from(u: Float[Array, " numbers"], jitter: float, scattered_share: float) -> Float[Array, " v"]:
+def azimuths_from(
+    u: Float[Array, " numbers"], jitter: float, scattered_share: float, count: Int[Array, ""] | None = None
+) -> Float[Array, " v"]:
     """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere.
 
-    u: 2 + 2 v numbers in [0, 1).
+    u: 2 + 2 v numbers in [0, 1). count: how many go around once; None: all.
     """
-    count = len(u) // 2 - 1
-    scattered, start, offsets, places = u[0], u[1], u[2 : 2 + count], u[2 + count :]
-    even = 2 * np.pi / count * (jnp.arange(count) + jitter * (offsets - 0.5)) + 2 * np.pi * start
+    v = len(u) // 2 - 1
+    scattered, start, offsets, places = u[0], u[1], u[2 : 2 + v], u[2 + v :]
+    spacing = 2 * np.pi / (v if count is None else count)
+    even = spacing * (jnp.arange(v) + jitter * (offsets - 0.5)) + 2 * np.pi * start
     return jnp.where(scattered < scattered_share, 2 * np.pi * places, even)
 
 

@@ -11,16 +11,18 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.views import SubjectViews, prepare_inputs
+from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import load_weights
 from humangs_jax.people import on_the_fly, subject, surroundings
 from humangs_jax.people.anatomy import joint_positions
-from humangs_jax.people.bank import build_bank, load_bank, save_bank
+from humangs_jax.people.bank import build_bank, load_bank, save_bank, to_silhouettes
 from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
 from humangs_jax.people.subject import DEMO, TEST, make_subject
+from humangs_jax.people.surfaces import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SEEDS = (DEMO[0], DEMO[4])
@@ -327,3 +329,40 @@ def test_a_bank_is_a_source_of_its_split(bank, example):
     again = jitted_example(bank, source.drawn_key(0, 3), config=CONFIG)
     np.testing.assert_array_equal(made.inputs.images, again.inputs.images)
     assert jax.tree.structure(made) == jax.tree.structure(example)
+
+
+def test_displaced_bodies_and_fewer_photos(bank, body):
+    moved = np.random.default_rng(0).normal(0, 0.01, (bank.people, 5, 3)).astype(np.float16)
+    bank = replace(bank, displacements=jnp.asarray(moved))
+    config = dataclasses.replace(CONFIG, input_views=3, view_counts=(2,), displaced_share=1.0, mirrored_share=1.0)
+    given = jitted_example(bank, jax.random.key(1), config=config)
+    plain = jitted_example(bank, jax.random.key(1), config=dataclasses.replace(config, view_counts=(), displaced_share=0.0))
+    assert plain.inputs.displacement is plain.inputs.view_count is None
+    who = [i for i in range(bank.people) if (np.asarray(bank.betas[i]) == np.asarray(given.inputs.betas)).all()]
+    np.testing.assert_array_equal(given.inputs.displacement, moved[who[0]])
+    assert given.inputs.view_count == 2
+    np.testing.assert_array_equal(given.inputs.images[2], given.inputs.images[1])
+    assert (given.inputs.images[1] != given.inputs.images[0]).any()
+    # the displaced are not mirrored: their targets are the mirror images of those that are
+    np.testing.assert_allclose(given.targets.images, plain.targets.images[..., ::-1, :], atol=0.02)
+
+
+def test_fewer_azimuths_go_around_once():
+    numbers = jnp.asarray([0.9, 0.25, *[0.5] * 12])
+    around = surroundings.azimuths_from(numbers, 0.7, 0.2, jnp.asarray(4))
+    np.testing.assert_allclose(np.diff(around), np.pi / 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        surroundings.azimuths_from(numbers, 0.7, 0.2, jnp.asarray(6)), surroundings.azimuths_from(numbers, 0.7, 0.2)
+    )
+
+
+@pytest.mark.slow
+def test_a_displaced_body_fills_the_silhouettes_of_the_clothes(body):
+    carrier = gaussian_body(body, load_weights()[1])
+    dressed, bare = (make_subject(seed, body) for seed in (DEMO[0], DEMO[4]))
+    for person in (dressed, bare):
+        moved = to_silhouettes(person, carrier, np.zeros((len(person.build.joints), 3), np.float32))
+        assert moved.shape == carrier.template.shape and np.abs(moved).max() <= 0.15
+        rest = shape_body(carrier, jnp.asarray(person.betas)).vertices
+        outwards = (np.asarray(vertex_normals(np.asarray(rest), np.asarray(carrier.faces))) * moved).sum(-1)
+        assert np.quantile(outwards, 0.9) > 0.003
