@@ -27,7 +27,7 @@ def vertex_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f
     return np.stack([np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1)
 
 
-def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
     """Vectors over their lengths; those without length as they are."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 

@@ -203,11 +203,6 @@ def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
     return (distance <= BOUNDARY * len(inside)).astype(np.float32)
 
 
-def boundary_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in dB of two (h, w, 3) images in the `boundary_band` of a mask (h, w)."""
-    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), jnp.asarray(boundary_band(mask))))
-
-
 # Structural similarity (Wang et al., 2004): differentiable and fast on every backend. Windows differ between papers. `GAUSSIAN`
 # and `UNIFORM` give the numbers of scikit-image's `structural_similarity(data_range=1, channel_axis=-1)`, the first with
 # `win_size=11, gaussian_weights=True`; `TORCHMETRICS` those of torchmetrics'

@@ -9,7 +9,7 @@ from humangs_jax.losses.losses import (
     BOUNDARY,
     FAR_SURFACE,
     LARGEST_PSNR,
-    boundary_psnr,
+    boundary_band,
     masked_psnr,
     psnr,
     ray_spread,
@@ -106,8 +106,9 @@ def test_only_the_band_along_the_boundary_counts():
     middle[100:150, 100:150] = 1
     corner[:20, :20] = 1
     edge[66, 100:110] = 0.5  # the third pixel inside
-    assert boundary_psnr(middle, truth, inside) == boundary_psnr(corner, truth, inside) == LARGEST_PSNR
+    found = lambda image: masked_psnr(*map(jnp.asarray, (image, truth, boundary_band(inside))))
+    assert found(middle) == found(corner) == LARGEST_PSNR
     width = round(BOUNDARY * SIDE)
     band = 4 * 128 * 2 * width  # but for the corners, outside rounded and inside shared
     expected = -10 * np.log10(10 * 0.25 / band)
-    assert boundary_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)
+    assert found(edge) == pytest.approx(expected, abs=0.1)

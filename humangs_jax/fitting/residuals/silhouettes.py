@@ -24,6 +24,7 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.state import robust
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.mesh import unit
 from humangs_jax.network.maps import sample_bilinear
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
@@ -114,7 +115,7 @@ def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdge
     turns = (towards[first] != towards[second]) | (second < 0)
     chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))
     ends = edges.ends[chosen]
-    normals = _unit(view.normals[ends].sum(axis=1))
+    normals = unit(view.normals[ends].sum(axis=1))
     middles = view.pixels[ends].mean(axis=1)
     outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(middles, view.covered.shape)
     ends, normals = ends[outside], normals[outside]
@@ -142,7 +143,7 @@ def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
     column, row = np.floor(positions).astype(int).T
-    return Boundary(positions.astype(np.float32), _unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
+    return Boundary(positions.astype(np.float32), unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
 
 
 def inside_image(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "*p"]:
@@ -165,10 +166,6 @@ def _spread(lengths: Float[np.ndarray, " l"], count: int) -> tuple[Int[np.ndarra
     places = (np.arange(count) + 0.5) / count * ends[-1]
     piece = np.searchsorted(ends, places)
     return piece, 1 - (ends[piece] - places) / lengths[piece]
-
-
-def _unit(vectors: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 2"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 LOOKS = 129
