@@ -119,20 +119,10 @@ def refine_with_report(
     progress: bool = False,
     watch: Callable[[Avatar], None] | None = None,
 ) -> Refinement:
-    """`refine`, with the number of steps, the seconds and the gain.
+    """`refine`, with the number of steps, the seconds and the gain. Arguments, errors: as there.
 
-    Arguments:
-        avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. seconds, steps:
-            the limits, instead of those of the configuration. A number of steps repeats a run exactly on the same machine;
-            `Refinement.planned` is that of a run that was limited by its seconds. progress: show a bar. watch: gets the avatar so
-            far after the iterations and at each of the `checks`, also in the trial; its time counts.
-
-    Ctrl-C ends the run; the best state until then is returned.
-
-    Views whose mask does not show the person are left out, and exposure is made equal as in `reconstruct`.
-
-    Raises: ValueError if the capture has no view or no masks or no view that shows the person, or its poses have another number
-    of joints than the avatar.
+    A number of steps repeats a run exactly on the same machine; `Refinement.planned` is that of a run that was limited by its
+    seconds.
     """
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
