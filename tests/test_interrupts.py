@@ -86,6 +86,7 @@ def test_what_is_asked_to_end_tidies_up(name, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_that_saves_for_longer_than_our_patience_is_not_ended(tmp_path):
     saving = """
         with stop_requested() as stopping:

@@ -173,6 +173,7 @@ def with_z_up(photos):
     return dataclasses.replace(photos, cameras=cameras, poses=poses)
 
 
+@pytest.mark.slow
 def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     photos = capture(body, SIZE, SIZE)
     turned = with_z_up(photos)

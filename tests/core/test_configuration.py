@@ -108,7 +108,9 @@ def leaves(value, path=()):
         yield path
 
 
-@pytest.mark.parametrize("whole", [settings.PRESETS["best"], config.tiny()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "whole", [settings.PRESETS["best"], pytest.param(config.tiny(), marks=pytest.mark.slow)], ids=lambda x: type(x).__name__
+)
 def test_any_value_in_any_field_is_read_or_refused_in_one_line(whole):
     text, refused = config_to_json(whole), 0
     for path in leaves(json.loads(text)):

@@ -349,7 +349,7 @@ def write_obj(folder):
 def bank_arrays():
     p, n, f, q, j, k = 2, 8, 4, 2, 5, 4
     return {
-        **{"format": np.asarray("humangs-people"), "version": np.asarray(1), "split": np.asarray("train")},
+        **{"format": np.asarray("humangs-people"), "version": np.asarray(2), "split": np.asarray("train")},
         **{"generator": np.asarray(1), "parents": np.asarray([-1, 0, 1, 2, 3]), "mirrored_joints": np.arange(j)},
         **{"seeds": np.asarray([0, 1], np.int32), "betas": np.zeros((p, 3), np.float32)},
         **{"joints": np.zeros((p, j, 3), np.float32), "vertex_counts": np.full(p, n, np.int32)},
@@ -359,7 +359,7 @@ def bank_arrays():
         **{"face_pieces": np.zeros((p, f), np.uint8), "sheen": np.zeros((p, 32), np.float32)},
         **{"groups": np.zeros((p, 32), np.uint8), "dyeable": np.zeros((p, 32), np.float32)},
         **{"texture": np.zeros((p, 8, 8, 6), np.uint8), "rotations": np.zeros((p, q, j, 3), np.float32)},
-        "nearest": np.zeros((p, q), np.int32),
+        **{"nearest": np.zeros((p, q), np.int32), "displacements": np.zeros((p, 0, 3), np.float16)},
     }
 
 

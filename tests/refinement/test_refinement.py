@@ -56,6 +56,7 @@ def test_what_no_photo_sees_stays(body, person):
     assert np.abs(refined.gaussians.means[50:] - avatar.gaussians.means[50:]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_refined_avatars_look_the_same_at_other_sizes(person):
     """As an image of the photos' size, reduced, does; and at that size as the optimised Gaussians do."""
     avatar, capture = person

@@ -140,6 +140,7 @@ def test_another_configuration_is_refused_before_anything_runs(body, captures, w
         train(dataclasses.replace(CONFIG, seed=1), body, captures[:2], whole[1], progress=False)
 
 
+@pytest.mark.slow
 def test_a_broken_folder_is_named_and_logged(body, captures, variables, tmp_path, caplog):
     broken = tmp_path / "broken"
     broken.mkdir()
