@@ -1,0 +1,173 @@
+"""Train the shipped network further on an accelerator that is at hand for minutes: the learning rate falls with the clock."""
+
+import concurrent.futures
+import dataclasses
+import functools
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from experiments.harness import Run, entry
+from humangs_jax.body.library import load_body
+from humangs_jax.core.processes import compiler_options
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.losses.loss_networks import load_loss_networks
+from humangs_jax.network.weights import load_weights, save_weights
+from humangs_jax.people.bank import build_bank, load_bank
+from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
+from humangs_jax.people.subject import seeds_of
+from humangs_jax.training import config as presets
+from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import seed_numbers, update
+
+FOR_EVER = 100_000_000
+"""Steps of a run whose learning rate does not fall by itself."""
+WARM_UP, EMA, LOGGED, SAVED, RESERVE = 40, 0.998, 20, 90.0, 6.0
+"""Steps until the full learning rate; decay of the average; steps between lines of the log; seconds between weights on disk;
+seconds that the last ones may take."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clock:
+    """Of a run.
+
+    Options:
+    minutes: in all, with the people and the compilation
+    people: of the training seeds, rendered anew for every step
+    first: of these seeds
+    bank: file of a bank with displacements instead
+    batch: people a step
+    at_once: of these, the rest follow
+    learning_rate: the peak
+    lpips: weight of LPIPS (AlexNet) in the loss
+    displaced: share of the examples whose body is displaced to the silhouettes of the clothes
+    seed: of order and views
+    start_share: of the first weights in OUT/mean.safetensors, the rest are the trained ones (`train_shipped.py`)
+    """
+
+    minutes: float = 8.0
+    people: int = 450
+    first: int = 1000
+    bank: Path | None = None
+    batch: int = 8
+    at_once: int = 8
+    learning_rate: float = 3e-4
+    lpips: float = 0.1
+    displaced: float = 0.5
+    seed: int = 0
+    start_share: float = 0.5
+
+
+@entry
+def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
+    """Train the shipped network further, for minutes, on people rendered on the fly; writes OUT/weights.safetensors, averaged.
+
+    The step compiles while other processes make the people. One program serves all numbers of photos.
+    """
+    began, body, (variables, model) = monotonic(), load_body(), load_weights()
+    clock = lambda: monotonic() - began
+    carrier, config = gaussian_body(body, model), configured(how)
+    config = dataclasses.replace(config, model=dataclasses.replace(model, runtime=config.model.runtime))  # room for tokens
+    networks = load_loss_networks(lpips_net="alex", installed=True)
+    state, average = (init_state(config, variables) for _ in range(2))
+    average = average.params
+    make = functools.partial(build_bank, body=body, split="train", displaced=carrier)
+    seeds, processes = seeds_of("train", how.first, how.people), max(1, (os.cpu_count() or 1) - 1)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        wanted = pool.submit(make, seeds, processes=processes) if how.bank is None else pool.submit(load_bank, how.bank)
+        examples = examples_of(config, how)
+        batch = jax.eval_shape(examples, make(seeds[:1]), 0)
+        given = carrier, networks, seed_numbers(how.seed)
+        step = stepper(config).lower(state, average, batch, *given, 1.0).compile()
+        print(f"compiled after {clock():.0f} s", flush=True)
+        bank = wanted.result()
+    examples = jax.jit(examples).lower(bank, 0).compile()
+    print(f"{bank.people} people after {clock():.0f} s", flush=True)
+
+    out.mkdir(parents=True, exist_ok=True)
+    start, saved, done, end, metrics = clock(), clock(), 0, 60 * how.minutes - RESERVE, {}
+    with open(out / "log.jsonl", "w", buffering=1) as log:
+        while (now := clock()) < end:
+            rate = min(1.0, (done + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * (now - start) / (end - start)))
+            batch = examples(bank, done)
+            jax.block_until_ready(metrics)  # of the step before: the clock runs with the device
+            state, average, metrics = step(state, average, batch, *given, rate)
+            done += 1
+            if done % LOGGED == 0:
+                numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
+                log.write(json.dumps({"step": done, "seconds": clock(), "rate": rate} | numbers) + "\n")
+            if now - saved > SAVED:
+                saved = now
+                save_weights(out / "weights.safetensors", state_variables(average, state), model, "float16")
+    trained = state_variables(average, state)
+    mean = jax.tree.map(lambda a, b: how.start_share * a + (1 - how.start_share) * b, variables, trained)
+    for name, made in {"weights": trained, "mean": mean}.items():
+        save_weights(out / f"{name}.safetensors", made, model, "float16")
+    record = {"steps": done, "people": bank.people, "seconds": clock(), "training_seconds": clock() - start}
+    record |= {"device": jax.devices()[0].device_kind} | dataclasses.asdict(how)
+    (out / "run.json").write_text(json.dumps(record, default=str))
+    print(record)
+
+
+def configured(how: Clock) -> TrainConfig:
+    """The preset `small`, with a learning rate that the clock lowers."""
+    config = presets.small()
+    return dataclasses.replace(
+        config,
+        loss=dataclasses.replace(config.loss, lpips=how.lpips),
+        optimizer=dataclasses.replace(config.optimizer, learning_rate=how.learning_rate, warmup_steps=0),
+        steps=FOR_EVER,
+        batch_size=how.batch,
+        microbatch_size=how.at_once,
+        ema_decay=None,
+    )
+
+
+def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
+    """(bank, step) -> the batch of a step."""
+    views = config.views
+    drawn = OnTheFlyConfig(
+        input_views=max(views.input_counts),
+        view_counts=views.input_counts,
+        target_views=views.target_count,
+        input_size=config.model.conventions.image_size,
+        target_size=config.target_size,
+        mixed_pose_share=views.mixed_pose_share,
+        depths=True,
+        displaced_share=how.displaced,
+    )
+    if jax.default_backend() != "cpu":
+        drawn = dataclasses.replace(drawn, views_at_once=drawn.input_views + drawn.target_views, pixels_per_step=1 << 30)
+
+    def examples(bank, step):
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(how.seed), step), how.batch)
+        return jax.lax.map(lambda key: on_the_fly_example(bank, key, drawn), keys)
+
+    return examples
+
+
+def stepper(config: TrainConfig) -> Any:
+    """A step of `training.step.update` at a share of the learning rate, to which an update is proportional."""
+
+    def step(state, average, batch, body, networks, seed, rate):
+        new, metrics = update(state, batch, body, networks, seed, config)
+        params = jax.tree.map(lambda a, b: a + rate * (b - a), state.params, new.params)
+        decay = jnp.minimum(EMA, (1 + state.step) / (10 + state.step))
+        return replace(new, params=params), optax.incremental_update(params, average, 1 - decay), metrics
+
+    return jax.jit(step, donate_argnums=(0, 1), compiler_options=compiler_options())
+
+
+def state_variables(average: Any, state: Any) -> Any:
+    """Averaged variables of a state."""
+    return {"params": average, "batch_stats": state.batch_stats}
