@@ -160,7 +160,6 @@ SLOW = (
     "evaluate me --avatar avatar.npz --protocol lhm",
 )
 """And on the demo's photos, in this order: the first ones make what the others read."""
-HEAVY = ("tests/", "experiments.train_shipped.py")
 MORE = (
     [],
     ["1"],
@@ -256,14 +255,8 @@ def with_options():
 def test_documented_scripts_exist_and_take_their_options(tmp_path):
     ours = [command for command in SCRIPTS if command.words[1] not in FOREIGN]
     assert [str(command) for command in ours if not (ROOT / command.words[1]).is_file()] == []
-    asked = [command for command in with_options() if not command.words[1].startswith(HEAVY)]
+    asked = with_options()
     assert asked and wrong_scripts(asked, tmp_path) == []
-
-
-@pytest.mark.slow  # they import jax before they look at their options
-def test_documented_scripts_that_import_much_take_their_options(tmp_path):
-    asked = [command for command in with_options() if command.words[1].startswith(HEAVY)]
-    assert len(asked) > 3 and wrong_scripts(asked, tmp_path) == []
     assert list(tmp_path.iterdir()) == []  # none has begun its work
 
 
