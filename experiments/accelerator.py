@@ -1,7 +1,8 @@
-"""What an accelerator does: agreement with the CPU, times, the batch that fits."""
+"""What an accelerator does: agreement with the CPU, and times."""
 
 import dataclasses
 import functools
+import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import numpy as np
 
 from experiments.harness import Run, entry
 from experiments.reconstruction import benchmark, configured
-from experiments.results import markdown_table
+from experiments.results import markdown_table, page_of, publish, significant
 from experiments.splatting import demo_scene
 from experiments.timing import medians, timed
 from humangs_jax.avatar.frames import motion_frames
@@ -55,8 +56,10 @@ Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
 @entry
-def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False) -> None:
-    """What an accelerator does: agreement with the CPU, times, the batch that fits. What fails is noted, and the next one begins.
+def accelerator(
+    run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False, earlier: tuple[Path, ...] = ()
+) -> None:
+    """What an accelerator does: agreement with the CPU, and times. What fails is noted, and the next one begins.
 
     check: the same numbers on CPU and device: the shipped network, splatting by the schedule of each with gradients, a resumed
     run. splatting: forward and with gradients, beside gsplat if it is installed. schedule: the same, by settings of the schedule.
@@ -66,19 +69,32 @@ def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: boo
     Options:
     stage: which
     small: sizes that a CPU rehearses in minutes
+    earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`: their rows are published together, and
+        nothing is measured
     """
+    if earlier:
+        records = [json.loads(path.read_text()) for path in earlier]
+        rows = {name: row for record in records for name, row in record["rows"].items()}
+        made = {name: records[0][name] for name in ("script", "arguments", "date", "machine", "versions")}
+        publish(page_of(run.table), run.table, table_of(records[0]["settings"]["device"], rows), rows, made)
+        return
     makers = {"check": check, "splatting": splatting, "schedule": schedule, "people": people, "training": training}
     makers |= {"reconstruct": reconstructed, "frames": frames, "network": network}
     settings = {"device": jax.devices()[0].device_kind, "small": small}
     cases = {f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in makers[name](small)}
     found = run.rows(cases, settings)
+    run.show(table_of(settings["device"], found), found)
+
+
+def table_of(device: str, found: dict[str, dict[str, Any]]) -> str:
+    """All numbers of the rows."""
     rows = [
-        [what, key, f"{value:.4g}" if isinstance(value, float) else str(value)]
+        [what, key, significant(value) if isinstance(value, float) else str(value)]
         for what, numbers in found.items()
         for key, value in numbers.items()
         if not isinstance(value, dict | list)
     ]
-    run.show(f"{settings['device']}.\n\n{markdown_table(['measurement', 'number', 'value'], rows, 'llr')}", found)
+    return f"{device}. Milliseconds, unless said otherwise.\n\n{markdown_table(['measurement', 'number', 'value'], rows, 'llr')}"
 
 
 def _tried(measure):

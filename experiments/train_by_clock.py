@@ -89,7 +89,8 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
         batch = jax.eval_shape(examples, make(seeds[:1]), 0)
         given = carrier, networks, seed_numbers(how.seed)
         step = stepper(config).lower(state, average, batch, *given, 1.0).compile()
-        print(f"compiled after {clock():.0f} s", flush=True)
+        compiled = clock()
+        print(f"compiled after {compiled:.0f} s", flush=True)
         bank = wanted.result()
     examples = jax.jit(examples).lower(bank, 0).compile()
     print(f"{bank.people} people after {clock():.0f} s", flush=True)
@@ -113,10 +114,10 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     mean = jax.tree.map(lambda a, b: how.start_share * a + (1 - how.start_share) * b, variables, trained)
     for name, made in {"weights": trained, "mean": mean}.items():
         save_weights(out / f"{name}.safetensors", made, model, "float16")
-    record = {"steps": done, "people": bank.people, "seconds": clock(), "training_seconds": clock() - start}
-    record |= {"device": jax.devices()[0].device_kind} | dataclasses.asdict(how)
+    row = {"steps": done, "step": 1e3 * (clock() - start) / done, "people a second": how.batch * done / (clock() - start)}
+    settings = {"device": jax.devices()[0].device_kind} | dataclasses.asdict(how)
+    record = {"settings": settings, "rows": {f"training, {how.batch} people a step": row | {"s until compiled": compiled}}}
     (out / "run.json").write_text(json.dumps(record, default=str))
-    print(record)
 
 
 def configured(how: Clock) -> TrainConfig:

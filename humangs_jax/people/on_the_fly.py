@@ -85,6 +85,10 @@ class OnTheFlyConfig:
     pixels_per_step: Slots = knob(1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md")
     """Of the person, that are colored at a time: few for CPUs, whole images for accelerators."""
 
+    def __post_init__(self):
+        if max(self.view_counts, default=0) > self.input_views:
+            raise ValueError(f"view_counts {self.view_counts}: expected at most input_views, {self.input_views}")
+
 
 ON_THE_FLY = OnTheFlyConfig()
 
@@ -108,7 +112,9 @@ class Scene:
 
 
 def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
-    """Views of a person of the bank: inputs and targets."""
+    """Views of a person of the bank: inputs and targets. Raises: ValueError for a `displaced_share` of a bank that has none."""
+    if config.displaced_share and not bank.displacements.shape[1]:
+        raise ValueError("displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)")
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
     count = None

@@ -7,6 +7,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
@@ -22,7 +23,6 @@ from humangs_jax.people.anatomy import joint_positions
 from humangs_jax.people.bank import build_bank, load_bank, save_bank, to_silhouettes
 from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
 from humangs_jax.people.subject import DEMO, TEST, make_subject
-from humangs_jax.people.surfaces import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SEEDS = (DEMO[0], DEMO[4])
@@ -34,6 +34,11 @@ SEEN_ALIKE = 0.99
 """Share of bare-skin pixels where the body is as near: elsewhere skin under cloth, which the dressed mesh lacks, is in front."""
 MIRRORED = 0.96
 """Share of the body's pixels inside the mask; left and right of the body differ by up to 5 mm, edges by a pixel."""
+RECOMPILED = 1e-4
+"""Colors by two programs that draw the same; float32."""
+NEARER = 0.85
+"""Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm. Up to 2.5 cm may be left
+everywhere (`INSET`). Measured: 0.66 and 0.75."""
 LIKE_RENDERED = 30
 """PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at folds. Measured 34 or more."""
 
@@ -344,7 +349,11 @@ def test_displaced_bodies_and_fewer_photos(bank, body):
     np.testing.assert_array_equal(given.inputs.images[2], given.inputs.images[1])
     assert (given.inputs.images[1] != given.inputs.images[0]).any()
     # the displaced are not mirrored: their targets are the mirror images of those that are
-    np.testing.assert_allclose(given.targets.images, plain.targets.images[..., ::-1, :], atol=0.02)
+    np.testing.assert_allclose(given.targets.images, plain.targets.images[..., ::-1, :], atol=RECOMPILED)
+    with pytest.raises(ValueError, match="displaced_share: the bank has no displacements"):
+        jitted_example(replace(bank, displacements=bank.displacements[:, :0]), jax.random.key(1), config=config)
+    with pytest.raises(ValueError, match="expected at most input_views, 2"):
+        dataclasses.replace(CONFIG, view_counts=(1, 3))
 
 
 def test_fewer_azimuths_go_around_once():
@@ -364,5 +373,6 @@ def test_a_displaced_body_fills_the_silhouettes_of_the_clothes(body):
         moved = to_silhouettes(person, carrier, np.zeros((len(person.build.joints), 3), np.float32))
         assert moved.shape == carrier.template.shape and np.abs(moved).max() <= 0.15
         rest = shape_body(carrier, jnp.asarray(person.betas)).vertices
-        outwards = (np.asarray(vertex_normals(np.asarray(rest), np.asarray(carrier.faces))) * moved).sum(-1)
-        assert np.quantile(outwards, 0.9) > 0.003
+        cloth, rest, far = cKDTree(person.surface.vertices), np.asarray(rest), np.linalg.norm(moved, axis=-1) > 0.005
+        before, after = (cloth.query(points[far])[0] for points in (rest, rest + moved))
+        assert far.sum() > 100 and after.mean() < NEARER * before.mean()

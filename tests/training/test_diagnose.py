@@ -77,7 +77,7 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
 
 TOKENS = "encoder.tokenizer.linear"
 IN_BATCH = {
-    "photo": ("inputs.images", (0, 1, 16, 16, 2), TOKENS),  # on the person: the rest is not read
+    "photo": ("inputs.images", (0, 1, 16, 16, 2), TOKENS),  # a pixel of the person; the background is not read
     "target": ("targets.images", (0, 0, 5, 6, 0), "loss: squared"),
     "mask": ("targets.masks", (0, 1, 2, 3), "loss: silhouette"),
     "shape": ("inputs.betas", (0, 0), "position maps"),
