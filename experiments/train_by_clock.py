@@ -42,6 +42,7 @@ class Clock:
     """Of a run.
 
     Options:
+    init_weights: where to start; default: the shipped ones
     minutes: in all, with the people and the compilation
     people: of the training seeds, rendered anew for every step
     first: of these seeds
@@ -55,6 +56,7 @@ class Clock:
     start_share: of the first weights in OUT/mean.safetensors, the rest are the trained ones (`train_shipped.py`)
     """
 
+    init_weights: Path | None = None
     minutes: float = 8.0
     people: int = 450
     first: int = 1000
@@ -73,8 +75,9 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     """Train the shipped network further, for minutes, on people rendered on the fly; writes OUT/weights.safetensors, averaged.
 
     The step compiles while other processes make the people. One program serves all numbers of photos.
+    Raises: ValueError if no time is left to train.
     """
-    began, body, (variables, model) = monotonic(), load_body(), load_weights()
+    began, body, (variables, model) = monotonic(), load_body(), load_weights(how.init_weights)
     clock = lambda: monotonic() - began
     carrier, config = gaussian_body(body, model), configured(how)
     config = dataclasses.replace(config, model=dataclasses.replace(model, runtime=config.model.runtime))  # room for tokens
@@ -110,6 +113,8 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
             if now - saved > SAVED:
                 saved = now
                 save_weights(out / "weights.safetensors", state_variables(average, state), model, "float16")
+    if not done:
+        raise ValueError(f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left for training")
     trained = state_variables(average, state)
     mean = jax.tree.map(lambda a, b: how.start_share * a + (1 - how.start_share) * b, variables, trained)
     for name, made in {"weights": trained, "mean": mean}.items():
