@@ -69,7 +69,7 @@ def random_networks(config: Any) -> Any:
     key = jax.random.key(0)
     perceptual = Vgg19(random_weights(key, VGG19)) if config.loss.perceptual else None
     lpips = None
-    if config.loss.lpips:
+    if config.loss.lpips or config.loss.vgg16:
         slices = BACKBONES["vgg"]
         heads = [jax.numpy.full(count, 1.0 / count) for count in channels(slices)]
         lpips = Lpips(random_weights(key, slices), tuple(heads), "vgg")

@@ -207,7 +207,7 @@ DIRECTIONS = 3
 STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
 """Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
 exchange places in the depth order, and colors jump."""
-NETWORKS = ("perceptual", "lpips")
+NETWORKS = ("perceptual", "vgg16", "lpips")
 """Terms that need a network of their own."""
 SIDE, TARGETS, VERTICES = 32, 2, 800
 
