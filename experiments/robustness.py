@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments import changes
 from experiments.harness import Run, entry
-from experiments.results import REPOSITORY, markdown_table, write_json
+from experiments.results import REPOSITORY, markdown_table
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.reconstruct import fit_buffers
 from humangs_jax.body.library import load_body
@@ -202,10 +202,9 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
 
 @entry
 def limits(run: Run, people: int = 2) -> None:
-    """How far a quantity may be off, alone, until the mean PSNR of some people has fallen by 1 dB; writes assets/limits.json.
+    """How far a quantity may be off, alone, until the mean PSNR of some people has fallen by 1 dB.
 
-    People of the validation seeds, four photos of 256 pixels; linear between the values tried. With --publish,
-    humangs_jax/assets/limits.json is written for `humangs check --ranges`.
+    People of the validation seeds, four photos of 256 pixels; linear between the values tried.
 
     Options:
     people: how many
@@ -231,8 +230,6 @@ def limits(run: Run, people: int = 2) -> None:
         ends = ["-" if ranges[name][end] is None else f"{ranges[name][end]:.3g}" for end in ("low", "high")]
         values = ", ".join(f"{value:g}: {loss:.1f}" for value, loss in sorted(lost.items()))
         rows.append([f"{name}, {ranges[name]['unit']}".rstrip(", "), *ends, values])
-    if run.publish:
-        write_json(REPOSITORY / "humangs_jax/assets/limits.json", {"bound": BOUND, "ranges": ranges})
     header = ["quantity", "from", "to", "dB lost at each value tried"]
     run.show(markdown_table(header, rows, "lrrl"), {"losses": losses, "ranges": ranges})
 

@@ -5,15 +5,11 @@ line is the boundary of the body after the displacement of the capture, or after
 with its skirt. What is wrong with a view is said by `apps.quick_check`.
 
 On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to
-the cross of the body's landmark; where the body fits, disc and cross coincide. Below it: the error over time.
+the cross of the body's landmark; where the body fits, disc and cross coincide.
 """
 
 import dataclasses
-import itertools
-import json
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +17,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.quick_check import faults
-from humangs_jax.avatar.video import contact_sheet, tile
+from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
@@ -30,13 +26,12 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD, displacement
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.masks import person_box
 from humangs_jax.data.skirt import with_skirt
 from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.fitting.fit_capture import Examination
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.images import to_uint8, write_png
+from humangs_jax.io.images import to_uint8
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh, vertex_normals
 
 LONGEST_SIDE = 512
@@ -73,7 +68,7 @@ class ViewCheck:
     """Share of the body's pixels that are more than one pixel off the mask."""
     inside: float
     """Share of the body in the image."""
-    warnings: tuple[str, ...] = ()
+    warning: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +87,7 @@ class CheckReport:
     @property
     def ok(self) -> bool:
         """Whether there is no warning."""
-        return not (self.warnings or any(view.warnings for view in self.views))
+        return not (self.warnings or any(view.warning for view in self.views))
 
     def __str__(self) -> str:
         """A table, then the warnings."""
@@ -100,7 +95,7 @@ class CheckReport:
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
             outside = "" if view.outside is None else f"{view.outside:.1%}"
-            rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warnings))])
+            rows.append([view.name, iou, outside, f"{view.inside:.0%}", *("!" * bool(view.warning))])
         lines = text_table(rows)
         if self.displaced:
             how = "as body.npz says" if self.registered else "to the masks"
@@ -108,7 +103,7 @@ class CheckReport:
         if self.skirt:
             lines.append("reconstruct will put a skirt around the legs, as the masks show one (yellow)")
         lines += [f"warning: {warning}" for warning in self.warnings]
-        lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
+        lines += [f"warning: {view.name}: {view.warning}" for view in self.views if view.warning]
         if self.ok:
             lines.append(
                 "no warnings; look at the sheet all the same: silhouettes do not show whether left and right are exchanged"
@@ -123,7 +118,7 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     Raises: OSError if the sheet cannot be written.
     """
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
-    whole, found = faults(capture)
+    found = faults(capture)
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     vertices, tints = _posed_frames(capture), side_tints(capture.body)
@@ -136,21 +131,21 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     displaced = None if moves is None else _posed_frames(dataclasses.replace(capture, body=body, displacement=None), moves)
     moved_tints = side_tints(body)
     overlays, views = [], []
-    for i, (name, fault) in enumerate(zip(capture.names, found, strict=True)):
+    for i, (name, warning, inside) in enumerate(zip(capture.names, found.views, found.inside, strict=True)):
         drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i])
-        iou, outside, warnings = None, None, () if fault.problem is None else (fault.problem,)
+        iou = outside = None
         if capture.masks is not None:
             iou, outside = _agreement(np.asarray(drawn.covered), capture.masks[i] > MASK_THRESHOLD)
-            if not warnings and outside > MOST_OUTSIDE:
-                warnings = (WIDER.format(outside, *(FIXED if right else FREE)),)
+            if warning is None and outside > MOST_OUTSIDE:
+                warning = WIDER.format(outside, *(FIXED if right else FREE))
         overlays.append(overlay(capture.images[i], drawn))
         if displaced is not None:
             moved = _body_image(displaced[int(capture.frames[i])], body.faces, moved_tints, capture.cameras[i])
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
-        views.append(ViewCheck(name, iou, outside, fault.inside, warnings))
+        views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     farthest = 0.0 if moves is None else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
-    return CheckReport(tuple(views), whole, farthest, capture.displacement is not None, worn is not None)
+    return CheckReport(tuple(views), found.whole, farthest, capture.displacement is not None, worn is not None)
 
 
 def draw_body(
@@ -214,7 +209,7 @@ def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 def _label(view: ViewCheck) -> str:
     iou = "" if view.iou is None else f"  IoU {view.iou:.2f}"
-    return f"{'! ' if view.warnings else ''}{view.name}{iou}"
+    return f"{'! ' if view.warning else ''}{view.name}{iou}"
 
 
 # Fits -----------------------------------------------------------------------------------------------------------------
@@ -226,55 +221,17 @@ FINE = 2
 RADIUS, SMALL = 4, 2
 """Radii of discs on the body, and on hands and face, pixels of a tile."""
 WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
-TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 60, 10, 22
-"""Height of the plot's letters: a share of its width, within limits, pixels."""
-LINES = 10
-"""The plot's height in letters."""
 
 
 def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path) -> None:
-    """Write a sheet of up to 24 views, evenly chosen, as a PNG; below it the error over time if there are several frames.
+    """Write a sheet of up to 24 views, evenly chosen, as a PNG.
 
     Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot be written.
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
     drawn = [_with_keypoints(_overlay(capture, view), capture, keypoints, examination, view) for view in chosen]
-    sheet = tile(np.stack(drawn), labels=[_fit_label(examination, view) for view in chosen])
-    if len(examination.frames) > 1:
-        sheet = np.concatenate([sheet, plot_over_time(examination.frames, sheet.shape[1])])
-    write_png(out, sheet)
-
-
-def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndarray, "height width 3"]:
-    """A plot of the median error of each of at least two frames, pixels; NaN leaves a gap."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    text = int(np.clip(width * TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT))
-    plot = Image.new("RGB", (width, LINES * text), WHITE)
-    pen, font = ImageDraw.Draw(plot), ImageFont.load_default(text)
-    left, right, top, bottom = 3 * text, width - 2 * text, 2 * text, (LINES - 2) * text
-    finite = errors[np.isfinite(errors)]
-    highest = 1.05 * float(finite.max(initial=0.0)) or 1.0
-    x = lambda frame: left + (right - left) * frame / (len(errors) - 1)
-    y = lambda error: bottom - (bottom - top) * error / highest
-    for tick in _ticks(highest, 4):
-        pen.line([(left, y(tick)), (right, y(tick))], fill=(225, 225, 225))
-        pen.text((left - 6, y(tick)), f"{tick:g}", fill=BLACK, font=font, anchor="rm")
-    for tick in _ticks(len(errors) - 1, width / (6 * text), whole=True):
-        pen.line([(x(tick), bottom), (x(tick), bottom + 4)], fill=BLACK)
-        pen.text((x(tick), bottom + 6), f"{tick:g}", fill=BLACK, font=font, anchor="mt")
-    pen.line([(left, top), (left, bottom), (right, bottom)], fill=BLACK)
-    pen.text((left, top - 6), "median error of each frame, pixels", fill=BLACK, font=font, anchor="lb")
-    points = [(x(i), y(error)) if np.isfinite(error) else None for i, error in enumerate(errors)]
-    color = tuple(to_uint8(np.asarray(LEFT)).tolist())
-    for a, b in itertools.pairwise(points):
-        if a and b:
-            pen.line([a, b], fill=color, width=2)
-    for point in points:
-        if point:
-            pen.circle(point, 2, fill=color)
-    return np.asarray(plot) / 255
+    contact_sheet(np.stack(drawn), out, labels=[_fit_label(examination, view) for view in chosen])
 
 
 def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
@@ -324,67 +281,3 @@ def _color(name: str) -> tuple[int, ...]:
 def _fit_label(examination: Examination, view: int) -> str:
     fit = examination.report.views[view]
     return f"{fit.name}  {f'{fit.median:.1f} px' if fit.keypoints else 'no keypoints'}"
-
-
-def _ticks(highest: float | int, count: float | int, whole: bool = False) -> Float[np.ndarray, " n"]:
-    rough = highest / count
-    power = 10.0 ** np.floor(np.log10(rough))
-    step = power * next(x for x in (1, 2, 5, 10) if x * power >= rough * (1 - 1e-9))
-    return np.arange(0, highest * (1 + 1e-9), max(step, 1.0) if whole else step)
-
-
-# Ranges of use ---------------------------------------------------------------------------------------------------------
-
-LIMITS = "assets/limits.json"
-PHOTO_SIZE = 256
-"""Side of the photos that the ranges were measured with, pixels, which is what the shipped weights take."""
-
-
-def load_limits() -> dict[str, Any]:
-    """{"bound": dB, "ranges": {quantity: {"unit", "low", "high"}}}; an end that was never reached is None."""
-    return json.loads(resources.files("humangs_jax").joinpath(LIMITS).read_text())
-
-
-def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
-    """(least, most) over the views of what a capture itself shows: photos, camera distance in metres, height of the person in
-    pixels of a photo that is reduced to `PHOTO_SIZE`.
-    """
-    frames = np.asarray(capture.frames)
-    centers = np.asarray(capture.cameras.center, float)
-    pelvis = np.asarray(capture.body.joint_regressor)[0] @ np.asarray(capture.body.template)
-    distances = np.linalg.norm(centers - (np.asarray(capture.poses.translation, float)[frames] + pelvis), axis=-1)
-    found = {
-        "photos": (float(capture.view_count), float(capture.view_count)),
-        "distance of the cameras": (float(distances.min()), float(distances.max())),
-    }
-    if capture.masks is not None:
-        scale = PHOTO_SIZE / max(capture.masks.shape[1:])  # the network reduces larger photos
-        heights = [float(np.ptp(person_box(mask > MASK_THRESHOLD)[0])) * scale for mask in capture.masks]
-        found["height of the person"] = (min(heights), max(heights))
-    return found
-
-
-def limits_table(capture: Capture) -> str:
-    """A line a quantity: the range, what this capture has, and a mark where that lies outside."""
-    limits, own = load_limits(), quantities(capture)
-    title = f"ranges in which avatars lose less than {limits['bound']:g} dB, each alone (docs/stability.md):"
-    rows = []
-    for name, row in limits["ranges"].items():
-        low, high = row["low"], row["high"]
-        has = []
-        if name in own:
-            least, most = own[name]
-            outside = (low is not None and least < low) or (high is not None and most > high)
-            has = [f"here {_range(least, most, row['unit'])}", *("!" * outside)]
-        rows.append([name, _range(low, high, row["unit"]), *has])
-    return "\n".join([title, *text_table(rows, left=4)])
-
-
-def _range(low: float | int | None, high: float | int | None, unit: str) -> str:
-    if low is None and high is None:
-        return "any that was tried"
-    if low == high:
-        return f"{low:.3g} {unit}".strip()
-    if low is None:
-        return f"up to {high:.3g} {unit}".strip()
-    return f"{low:.3g} {unit} or more".replace("  ", " ") if high is None else f"{low:.3g} to {high:.3g} {unit}".strip()

@@ -5,22 +5,16 @@ mistakes that people make are undone on trial, and the one that explains it is n
 first; `humangs check` and `start` draw a sheet as well (`apps.check`).
 """
 
-import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.body_and_masks import points_in_image, surface_points
-from humangs_jax.data.calibration.calibration import (
-    CAM_FROM_WORLD_OPENGL,
-    CONVENTIONS,
-    ROTATION_TO_Y_UP,
-    WORLD_FROM_CAM,
-    WORLD_FROM_CAM_OPENGL,
-    pose_matrix,
-)
+from humangs_jax.data.calibration.calibration import OPENGL_FROM_OPENCV, ROTATION_TO_Y_UP, pose_matrix
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 
@@ -49,12 +43,12 @@ Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]
 _TO_Y_UP = pose_matrix(np.asarray(ROTATION_TO_Y_UP["+z"], float), np.zeros(3))
 MISTAKES: dict[str, Callable[[Matrix, Float[np.ndarray, "3"]], Matrix]] = {
-    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: CONVENTIONS[WORLD_FROM_CAM](m),
+    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
     "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
-        lambda m, t: CONVENTIONS[CAM_FROM_WORLD_OPENGL](m)
+        lambda m, t: OPENGL_FROM_OPENCV @ m
     ),
     "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
-        lambda m, t: CONVENTIONS[WORLD_FROM_CAM_OPENGL](m)
+        lambda m, t: OPENGL_FROM_OPENCV @ np.linalg.inv(m)
     ),
     "the camera's translation is in millimetres": lambda m, t: pose_matrix(m[:3, :3], m[:3, 3] / 1000),
     "the body's translation is in millimetres": lambda m, t: m @ pose_matrix(np.eye(3), t / 1000 - t),
@@ -70,166 +64,144 @@ MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
 """The same for silhouettes of body and mask."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewFault:
-    """What is wrong with a view."""
+class Faults(NamedTuple):
+    """What is wrong. whole: with the capture, a line each. views: with each view, a line or None.
 
-    problem: str | None
-    """A line; None: nothing."""
-    inside: float
-    """Share of the body in the frame."""
+    inside: of each view, the share of the body in the frame. explained: views that `whole` explains.
+    """
+
+    whole: tuple[str, ...]
+    views: tuple[str | None, ...]
+    inside: tuple[float, ...]
+    explained: set[int]
 
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
     """Warnings, one line each, about what looks wrong in a capture; of what concerns all of it first."""
     some = np.unique(np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int))
-    views = _Views.of(capture.select(some))
-    whole, explained = _faults_of_all(views)
-    found: dict[str, list[str]] = {}
-    for i, name in enumerate(views.names):
-        if i not in explained and (problem := _fault(views, i).problem):
-            found.setdefault(problem, []).append(name)
-    return (*whole, *(f"{problem}: view {few(names)}" for problem, names in found.items()))
+    found, by_problem = faults(capture.select(some)), {}
+    for i, problem in enumerate(found.views):
+        if problem is not None and i not in found.explained:
+            by_problem.setdefault(problem, []).append(capture.names[some[i]])
+    return (*found.whole, *(f"{problem}: view {few(names)}" for problem, names in by_problem.items()))
 
 
-def faults(capture: Capture) -> tuple[tuple[str, ...], tuple[ViewFault, ...]]:
-    """What is wrong with a capture as a whole, a line each, and with every view."""
-    views = _Views.of(capture)
-    return _faults_of_all(views)[0], tuple(_fault(views, i) for i in range(capture.view_count))
+def faults(capture: Capture) -> Faults:
+    """What is wrong with a capture as a whole, and with every view."""
+    views = _coarse_views(capture)
+    problems, inside = zip(*map(_fault, views), strict=True)
+    largest = float(np.linalg.norm(np.asarray(capture.poses.rotations, float), axis=-1).max())
+    if largest > LONGEST_TURN:
+        degrees = f"the poses seem to be in degrees: rotations up to {largest:.0f}, expected radians"
+        return Faults((degrees,), problems, inside, set(range(len(views))))
+    if exchanged := _exchanged_cameras(views):
+        pairs = [f"{views[i].name} by the camera of {views[j].name}" for i, j in exchanged.items()]
+        return Faults((f"cameras are exchanged: the body would fit {few(pairs)}",), problems, inside, set(exchanged))
+    return Faults((), problems, inside, set())
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Views:
-    """What is compared, in numpy: JAX would compile each of the small operations."""
+class _View(NamedTuple):
+    """What is compared, in numpy: JAX would compile each of the small operations. points: (p, 3) on the posed skin."""
 
-    names: tuple[str, ...]
-    points: list[np.ndarray]
-    """On the skin, of each view."""
-    masks: list[Cells] | None
-    exposures: list[str | None]
-    K: np.ndarray
-    cam_from_world: np.ndarray
-    translations: list[np.ndarray]
-    """Of the body, of each view."""
-    size: tuple[int, int]
-    largest: float
-    """The longest rotation vector of all poses."""
-
-    @classmethod
-    def of(cls, capture: Capture) -> "_Views":
-        rotations, translations = (np.asarray(x, float) for x in (capture.poses.rotations, capture.poses.translation))
-        frames, masks = [int(frame) for frame in capture.frames], capture.masks
-        points = surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS)
-        return cls(
-            capture.names,
-            [points[frame] for frame in frames],
-            None if masks is None else [_mask_cells(mask) for mask in masks],
-            [_exposure(image, None if masks is None else masks[i]) for i, image in enumerate(capture.images)],
-            np.asarray(capture.cameras.K, float),
-            np.asarray(capture.cameras.cam_from_world, float),
-            [translations[frame] for frame in frames],
-            (capture.cameras.width, capture.cameras.height),
-            float(np.linalg.norm(rotations, axis=-1).max()),
-        )
+    name: str
+    image: Float[np.ndarray, "h w 3"]
+    mask: Float[np.ndarray, "h w"] | None
+    cells: Cells | None
+    points: Float[np.ndarray, "p 3"]
+    K: Float[np.ndarray, "3 3"]
+    matrix: Matrix
+    translation: Float[np.ndarray, "3"]
 
 
-def _faults_of_all(views: _Views) -> tuple[tuple[str, ...], set[int]]:
-    """Mistakes that no view shows by itself, and the views that they explain."""
-    if views.largest > LONGEST_TURN:
-        degrees = f"the poses seem to be in degrees: rotations up to {views.largest:.0f}, expected radians"
-        return (degrees,), set(range(len(views.names)))
-    if not (exchanged := _exchanged_cameras(views)):
-        return (), set()
-    pairs = [f"{views.names[i]} by the camera of {views.names[j]}" for i, j in exchanged.items()]
-    return (f"cameras are exchanged: the body would fit {few(pairs)}",), set(exchanged)
+def _coarse_views(capture: Capture) -> list[_View]:
+    points, translations = surface_points(capture, POINTS), np.asarray(capture.poses.translation, float)
+    K, matrices = np.asarray(capture.cameras.K, float), np.asarray(capture.cameras.cam_from_world, float)
+    views = []
+    for i, frame in enumerate(capture.frames.tolist()):
+        mask = None if capture.masks is None else capture.masks[i]
+        cells = None if mask is None else _mask_cells(mask)
+        view = _View(capture.names[i], capture.images[i], mask, cells, points[frame], K[i], matrices[i], translations[frame])
+        views.append(view)
+    return views
 
 
-def _exposure(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"] | None) -> str | None:
-    """What is wrong with a photo on which the person is nearly black or burnt out: nothing is to be seen there."""
-    person = image if mask is None else image[mask > 0.99]  # without its blended edge
-    if person.size and np.quantile(person, 0.98) < DARKEST:
-        return "the person is nearly black; is the photo underexposed, or were its values divided by 255 twice"
-    if person.size and mask is not None and np.quantile(person, 0.4) > BURNT:
-        return "most of the person is white; is the photo overexposed"
-    return None
-
-
-def _exchanged_cameras(views: _Views) -> dict[int, int]:
-    """For views that fit the camera of another one: that one. An exchange has to explain all of its views."""
-    masks = views.masks or []
-    own = [_overlap(_silhouette(views, i)[0], mask) for i, mask in enumerate(masks)]
-    off = [i for i, overlap in enumerate(own) if overlap < SURELY_IOU]
-    if len(off) < 2:
-        return {}
-    from scipy.optimize import linear_sum_assignment  # takes longer to import than all else here to compute
-
-    overlaps = np.array([[_overlap(_silhouette(views, i, camera=j)[0], masks[i]) for j in off] for i in off])
-    chosen = linear_sum_assignment(-overlaps)[1].tolist()
-    found = {off[row]: (off[column], overlaps[row, column]) for row, column in enumerate(chosen) if row != column}
-    explains = all(overlap > max(SURELY_IOU, own[i] + BETTER) for i, (_, overlap) in found.items())
-    # a mirrored photo explains views around a person as well
-    mirrored = [_overlap(_silhouette(views, i)[0][:, ::-1], masks[i]) for i in found]
-    if not explains or sum(mirrored) >= sum(overlap for _, overlap in found.values()):
-        return {}
-    return {i: j for i, (j, _) in found.items()}
-
-
-def _fault(views: _Views, i: int) -> ViewFault:
-    body, inside, height = _silhouette(views, i)
-    mask = None if views.masks is None else views.masks[i]
-    if mask is not None and not mask.any():
-        return ViewFault("the mask is empty", inside)
+def _fault(view: _View) -> tuple[str | None, float]:
+    """What is wrong with a view, and the share of the body in the frame."""
+    body, inside, height = _silhouette(view)
+    if view.cells is not None and not view.cells.any():
+        return "the mask is empty", inside
     if inside < LEAST_INSIDE:
         problem = "most of the body is outside the frame, or behind the camera"
     elif height < LEAST_HEIGHT:
         problem = "the body is tiny, in metres it would not be"
-    elif mask is not None and _overlap(body, mask) < LEAST_IOU:
+    elif view.cells is not None and _overlap(body, view.cells) < LEAST_IOU:
         problem = "body and mask do not agree"
     else:
-        return ViewFault(views.exposures[i], inside)
-    cause = _cause(views, i, body, mask)
-    return ViewFault(problem if cause is None else f"{problem}; it would fit if {cause}", inside)
+        return _wrong_exposure(view), inside
+    cause = _cause(view, body)
+    return problem if cause is None else f"{problem}; it would fit if {cause}", inside
 
 
-def _cause(views: _Views, i: int, body: Cells, mask: Cells | None) -> str | None:
+def _wrong_exposure(view: _View) -> str | None:
+    """A person who is nearly black or burnt out shows nothing."""
+    person = view.image if view.mask is None else view.image[view.mask > 0.99]  # without its blended edge
+    if person.size and np.quantile(person, 0.98) < DARKEST:
+        return "the person is nearly black; is the photo underexposed, or were its values divided by 255 twice"
+    if person.size and view.mask is not None and np.quantile(person, 0.4) > BURNT:
+        return "most of the person is white; is the photo overexposed"
+    return None
+
+
+def _cause(view: _View, body: Cells) -> str | None:
     """The mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in the frame."""
     tried = {}
-    if mask is not None:
-        tried = {mistake: _overlap(*undo(body, mask)) for mistake, undo in MISTAKES_OF_IMAGES.items()}
+    if view.cells is not None:
+        tried = {mistake: _overlap(*undo(body, view.cells)) for mistake, undo in MISTAKES_OF_IMAGES.items()}
     for mistake, undo in MISTAKES.items():
-        drawn, inside, height = _silhouette(views, i, undo(views.cam_from_world[i], views.translations[i]))
+        drawn, inside, height = _silhouette(view._replace(matrix=undo(view.matrix, view.translation)))
         if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
-            tried[mistake] = 1.0 if mask is None else _overlap(drawn, mask)
+            tried[mistake] = 1.0 if view.cells is None else _overlap(drawn, view.cells)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
-    if best is None or tried[best] <= SURELY_IOU or (mask is None and len(tried) > 1):
+    if best is None or tried[best] <= SURELY_IOU or (view.cells is None and len(tried) > 1):
         return None
     return best
+
+
+def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
+    """For views that fit the camera of another one: that one. An exchange has to explain all of its views."""
+    drawn = lambda i, j: _silhouette(views[i]._replace(K=views[j].K, matrix=views[j].matrix))[0]
+    masks = {i: view.cells for i, view in enumerate(views) if view.cells is not None}
+    own = {i: _overlap(drawn(i, i), mask) for i, mask in masks.items()}
+    off = [i for i, overlap in own.items() if overlap < SURELY_IOU]
+    if len(off) < 2:
+        return {}
+    from scipy.optimize import linear_sum_assignment  # takes longer to import than all else here to compute
+
+    overlaps = np.array([[_overlap(drawn(i, j), masks[i]) for j in off] for i in off])
+    chosen = linear_sum_assignment(-overlaps)[1].tolist()
+    found = {off[row]: (off[column], overlaps[row, column]) for row, column in enumerate(chosen) if row != column}
+    explains = all(overlap > max(SURELY_IOU, own[i] + BETTER) for i, (_, overlap) in found.items())
+    # a mirrored photo explains views around a person as well
+    mirrored = sum(_overlap(drawn(i, i)[:, ::-1], masks[i]) for i in found)
+    if not explains or mirrored >= sum(overlap for _, overlap in found.values()):
+        return {}
+    return {i: j for i, (j, _) in found.items()}
 
 
 # Coarse silhouettes ---------------------------------------------------------------------------------------------------
 
 
-def _silhouette(views: _Views, i: int, matrix: Matrix | None = None, camera: int | None = None) -> tuple[Cells, float, float]:
-    """The cells that the body of view i covers; the share of its points in the image; and its height there, of the image's.
-
-    Arguments: matrix: in place of its camera's. camera: of another view.
-    """
-    camera, (width, height) = i if camera is None else camera, views.size
-    matrix = views.cam_from_world[camera] if matrix is None else matrix
-    pixels = points_in_image(views.points[i], views.K[camera], matrix, width, height)
-    shape, cell = _grid(width, height)
-    covered = np.zeros(shape, bool)
-    column, row = np.minimum((pixels / cell).astype(int), np.asarray(shape[::-1]) - 1).T
+def _silhouette(view: _View) -> tuple[Cells, float, float]:
+    """The cells that the body covers; the share of its points in the image; and its height there, of the image's."""
+    height, width = view.image.shape[:2]
+    pixels = points_in_image(view.points, view.K, view.matrix, width, height)
+    (rows, columns), cell = _grid(width, height)
+    covered = np.zeros((rows, columns), bool)
+    column, row = np.minimum((pixels / cell).astype(int), (columns - 1, rows - 1)).T
     covered[row, column] = True
+    closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[2:-2, 2:-2]  # gaps between the points
     tall = float(np.ptp(pixels[:, 1])) / height if len(pixels) else 0.0
-    return _closed(covered), len(pixels) / len(views.points[i]), tall
-
-
-def _closed(cells: Cells) -> Cells:
-    """Without the gaps of one cell between the points of a surface: dilated, then eroded."""
-    shifted = lambda x: [np.roll(x, (row, column), (0, 1)) for row in (-1, 0, 1) for column in (-1, 0, 1)]
-    grown = np.logical_or.reduce(shifted(np.pad(cells, 2)))
-    return np.logical_and.reduce(shifted(grown))[2:-2, 2:-2]
+    return closed, len(pixels) / len(view.points), tall
 
 
 def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:

@@ -14,7 +14,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
@@ -24,7 +23,6 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntable_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import (
     Few,
@@ -43,7 +41,6 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.body_and_masks import usable_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import select_views
-from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -222,9 +219,8 @@ class Cost:
 
     def worst(self, other: "Cost") -> "Cost":
         """The larger one of each."""
-        memory = None if None in (self.memory_mb, other.memory_mb) else max(self.memory_mb or 0.0, other.memory_mb or 0.0)
-        make, refine = max(self.make_ms, other.make_ms), max(self.refine_ms, other.refine_ms)
-        return Cost(make, refine, max(self.frame_ms, other.frame_ms), memory)
+        pairs = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
+        return Cost(*(None if None in pair else max(pair) for pair in pairs))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,17 +243,23 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tuned:
-    """What `tune` found. cost: of the point, the worse of two measurements. measured: all costs that were measured, by the name
-    of the point.
+    """What `tune` found. cost: of the point, the worse of two measurements. best: the point of the highest quality, whatever it
+    costs. measured: all costs that were measured, by the name of the point.
     """
 
     point: FrontPoint
     cost: Cost
+    best: FrontPoint
     measured: dict[str, Cost]
 
-
-class NoSettingError(ValueError):
-    """No setting is within the budget."""
+    def __str__(self) -> str:
+        """What was chosen, what it takes, and what it gives up against the best point, by the committed sweep."""
+        takes = f"{self.cost.reconstruct_ms:.0f} ms a reconstruction, {self.cost.frame_ms:.1f} ms a frame"
+        takes += "" if self.cost.memory_mb is None else f", {self.cost.memory_mb:.0f} MiB"
+        lost = self.best.psnr - self.point.psnr, self.best.psnr_poses - self.point.psnr_poses
+        gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against"
+        gives = "is the best of all settings" if self.point.name == self.best.name else f"{gives} {self.best.name!r}"
+        return f"{self.point.name}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 
 
 def load_front() -> list[FrontPoint]:
@@ -267,11 +269,6 @@ def load_front() -> list[FrontPoint]:
     return sorted(points, key=lambda point: point.make + point.refine)
 
 
-def usable(front: Sequence[FrontPoint], capture: Capture) -> list[FrontPoint]:
-    """The points that a capture can be made with: refinement needs masks."""
-    return [point for point in front if capture.masks is not None or point.settings.refinement is None]
-
-
 def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[str, Cost]) -> Cost:
     """The cost of a point that was not measured: for each part, that of the measured point nearest to it, times their ratio.
 
@@ -279,18 +276,15 @@ def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[st
     """
     known = [(other, measured[other.name]) for other in front if other.name in measured]
 
-    def part(name: str, value: Callable[[Cost], float]) -> float:
+    def part(name: str, of_cost: str) -> Any:
         wanted = getattr(point, name)
-        pairs = [(getattr(other, name), value(cost)) for other, cost in known if getattr(other, name) > 0]
+        pairs = [(getattr(other, name), getattr(cost, of_cost)) for other, cost in known if getattr(other, name) > 0]
         if wanted == 0 or not pairs:
             return 0.0  # refinement that nothing measured has: tried, and then measured
         ratio, found = min(pairs, key=lambda pair: abs(math.log(pair[0] / wanted)))
-        return found * wanted / ratio
+        return None if found is None else found * wanted / ratio
 
-    memory = None if any(cost.memory_mb is None for _, cost in known) else part("memory_mb", lambda c: c.memory_mb or 0.0)
-    return Cost(
-        part("make", lambda c: c.make_ms), part("refine", lambda c: c.refine_ms), part("frame", lambda c: c.frame_ms), memory
-    )
+    return Cost(part("make", "make_ms"), part("refine", "refine_ms"), part("frame", "frame_ms"), part("memory_mb", "memory_mb"))
 
 
 def choose(front: Sequence[FrontPoint], measured: Mapping[str, Cost], budget: Budget) -> FrontPoint | None:
@@ -327,28 +321,29 @@ def tune(
         memory_mb: the most memory that this may add to the process, MiB.
         size: side of the frames, pixels.
         front: points to choose from; None: those that come with the package. Those that ask for more photos than the capture has
-            are tried with all it has.
+            are tried with all it has, and without masks those that refine are not.
         progress: show a bar.
 
     Returns:
         The settings (`.point.settings`, for `reconstruct_with`) and what they cost.
 
     Raises:
-        NoSettingError: if no setting is within the budget; it says what the cheapest takes.
-        ValueError: if memory is limited where it cannot be measured.
+        ValueError: if no setting is within the budget, saying what the cheapest takes; or if memory is limited where it cannot be
+            measured.
 
     Examples:
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
         >>> avatar = hg.reconstruct_with(tuned.point.settings, *hg.load_weights(), capture)
     """
     budget = Budget(reconstruct_ms, frame_ms, memory_mb)
-    front = usable(load_front() if front is None else front, capture)
+    front = load_front() if front is None else front
+    front = [point for point in front if capture.masks is not None or point.settings.refinement is None]
     measured: dict[str, Cost] = {}
     confirmed = set()
     with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:
         while (point := choose(front, measured, budget)) is not None:
             if point.name in confirmed:
-                return Tuned(point, measured[point.name], measured)
+                return Tuned(point, measured[point.name], max(front, key=lambda each: each.quality), measured)
             shown.set_postfix_str(point.name)
             cost = measure(point.settings, variables, config, capture, size)
             if point.name in measured:
@@ -362,7 +357,7 @@ def tune(
     memory = [cost.memory_mb for cost in measured.values() if cost.memory_mb is not None]
     needs = f"{least['reconstruct_ms']:.0f} ms a reconstruction, {least['frame_ms']:.1f} ms a frame of {size} pixels"
     needs += f", {min(memory):.0f} MiB" if memory else ""
-    raise NoSettingError(
+    raise ValueError(
         f"no setting is within the budget: the least that was measured is {needs}, and {MARGIN - 1:.0%} of room is kept "
         "for a busy machine; smaller frames are faster"
     )
@@ -423,41 +418,3 @@ def _milliseconds(run: Callable[[], object]) -> float:
     began = time.perf_counter()
     run()
     return 1e3 * (time.perf_counter() - began)
-
-
-def in_words(tuned: Tuned, best: FrontPoint) -> str:
-    """What was chosen, what it takes, and what it gives up against the best setting, by the committed sweep."""
-    settings, cost, point = tuned.point.settings, tuned.cost, tuned.point
-    views, size = settings.views, settings.runtime.image_size
-    parts = ["all photos" if views is None else f"{views} photo{'s' * (views > 1)}"]
-    parts += [f"of {size} pixels"] if size else []
-    parts += ["cut to the person"] if settings.runtime.crop else []
-    refined = [f"{n} {name}" for n, name in ((settings.refine_iterations, "iterations"), (settings.refine_steps, "steps")) if n]
-    parts += [f"{' and '.join(refined)} of refinement" if refined else "no refinement"]
-    parts += [f"drawn {settings.splat}"]
-    takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
-    takes += "" if cost.memory_mb is None else f", {cost.memory_mb:.0f} MiB"
-    lost = best.psnr - point.psnr, best.psnr_poses - point.psnr_poses
-    gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against {best.name!r}"
-    gives = "is the best of all settings" if point.name == best.name else gives
-    return f"{point.name}: {', '.join(parts)}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
-
-
-def both_avatars(
-    variables: Variables, config: HumanGSConfig, capture: Capture, chosen: FrontPoint, best: FrontPoint, size: int
-) -> Float[np.ndarray, "h w 3"]:
-    """The person of a capture as two settings make and draw it: left the chosen one, right the best."""
-    images = []
-    for point in (chosen, best):
-        avatar = reconstruct_with(point.settings, variables, config, capture, progress=True)
-        rgb = np.asarray(next(frames_of(avatar, point.settings, size)).rgb)
-        images.append(np.clip(rgb, 0, 1))
-    return np.concatenate(images, axis=1)
-
-
-def write_tuned(out: Path, image: Float[np.ndarray, "h w 3"], tuned: Tuned, budget: Budget, size: int) -> None:
-    """The settings, and beside them the image: `out` with the suffix .png. Raises: OSError."""
-    write_png(out.with_suffix(".png"), image)
-    measured = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
-    about = {"name": tuned.point.name, "budget": dataclasses.asdict(budget), "frame_size": size, "measured": measured}
-    save_settings(out, tuned.point.settings, **about)

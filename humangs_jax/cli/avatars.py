@@ -43,8 +43,7 @@ _USUAL_UP = f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').s
 class Demo:
     """Try everything on the shipped person.
 
-    Reconstructs, refines, renders held-out views, animates, and writes the avatar. The same command goes on after an
-    interruption.
+    Reconstructs, refines, renders held-out views, animates, and writes the avatar; all at the end.
     """
 
     examples: ClassVar[tuple[str, ...]] = ("humangs demo --out demo_out", "humangs demo --refine 0 --preset realtime")
@@ -424,7 +423,7 @@ class Tune:
     capture: Positional[Path]
     """Folder with capture.json; "demo_capture" is the shipped one."""
     out: Annotated[Path, Place((".json",))] = Path("tuned.json")
-    """The settings to write; beside them an image of the same name."""
+    """The settings to write."""
     reconstruct_ms: float | None = None
     """The most that making the avatar may take, with refinement, milliseconds."""
     frame_ms: float | None = None
@@ -443,22 +442,19 @@ class Tune:
         for name, value in budgets.items():
             if value is not None and not value > 0:
                 raise UsageError(f"--{name.replace('_', '-')} {value}: expected a positive number")
-        require_file(self.out.with_suffix(".png"), (".png",))
         with stage("starting"):
-            from humangs_jax.apps.settings import Budget, both_avatars, in_words, load_front, tune, usable, write_tuned
+            from humangs_jax.apps.settings import save_settings, tune
             from humangs_jax.network.weights import load_weights
 
         photos = _read_capture(self.capture, check=False)
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
-        front, budget = usable(load_front(), photos), Budget(**budgets)
-        best = max(front, key=lambda point: point.quality)
         with stage("measuring"):
-            tuned = tune(variables, config, photos, **budgets, size=self.size, front=front, progress=True)
-        with stage("drawing both"):
-            image = both_avatars(variables, config, photos, tuned.point, best, self.size)
-        write_tuned(self.out, image, tuned, budget, self.size)
-        tell(in_words(tuned, best))
-        wrote(self.out, f"settings; {self.out.with_suffix('.png')}: the person made by them and by {best.name!r}")
+            tuned = tune(variables, config, photos, **budgets, size=self.size, progress=True)
+        costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
+        about = {"name": tuned.point.name, "budget": budgets, "frame_size": self.size, "measured": costs}
+        save_settings(self.out, tuned.point.settings, **about)
+        tell(tuned)
+        wrote(self.out, "settings")
         weights = () if self.weights is None else ("--weights", self.weights)
         suggest("humangs reconstruct", self.capture, "--config", self.out, *weights)

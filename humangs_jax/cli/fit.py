@@ -256,14 +256,12 @@ class Check:
     For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png", "humangs check me --ranges")
+    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png",)
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
     out: Annotated[Path, Place((".png",))] = Path("check.png")
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
-    ranges: bool = False
-    """Also print the ranges in which avatars stay good, and where this capture lies in them (docs: stability)."""
 
     def run(self) -> None:
         sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
@@ -287,10 +285,6 @@ class Check:
             same = record is not None and record.names == capture.names
             report = check_capture(capture, self.out, record.keypoints if same else keypoints)
         tell(report)
-        if self.ranges:
-            from humangs_jax.apps.check import limits_table
-
-            tell(limits_table(capture))
         wrote(self.out, "the body over the photos")
         ok = report.ok
         if record is not None or keypoints is not None:

@@ -16,12 +16,13 @@ body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All on the host, by num
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from PIL import Image, ImageDraw
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Bool, Float, Int
@@ -68,11 +69,9 @@ def unusable_views(capture: Capture) -> dict[int, str]:
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
         return found
-    rotations, translations = np.asarray(capture.poses.rotations), np.asarray(capture.poses.translation)
-    frames = [int(frame) for frame in capture.frames]
-    points = surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS)
+    points = surface_points(capture, POINTS)
     K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
-    for i, frame in enumerate(frames):
+    for i, frame in enumerate(capture.frames.tolist()):
         mask = np.asarray(capture.masks[i])
         if i in found or not np.isfinite(points[frame]).all():
             continue
@@ -90,27 +89,33 @@ def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
 # Points on the skin ---------------------------------------------------------------------------------------------------
 
 
-def surface_points(
-    body: BodyModel,
-    betas: Float[np.ndarray, " s"],
-    rotations: Float[np.ndarray, "m j 3"],
-    translations: Float[np.ndarray, "m 3"],
-    frames: Sequence[int],
-    count: int,
-) -> dict[int, Float[np.ndarray, "count 3"]]:
-    """Points spread evenly over the skin, metres, by frame; without pose correctives."""
-    rest = np.asarray(body.template) + np.asarray(body.shape_directions)[..., : len(betas)] @ np.asarray(betas)
+def surface_points(capture: Capture, count: int) -> dict[int, Float[np.ndarray, "count 3"]]:
+    """Points spread evenly over the skin, metres, by the frames that views show; without pose correctives."""
+    body, rest = capture.body, shaped(capture.body, capture)
     joints = np.asarray(body.joint_regressor) @ rest
     corners, weights = _sampling(rest, np.asarray(body.faces), count)
     used, corners = np.unique(corners, return_inverse=True)
-    skinning, rest, corners = np.asarray(body.skinning_weights)[used], rest[used], corners.reshape(weights.shape)
+    skinning, corners = np.asarray(body.skinning_weights)[used], corners.reshape(weights.shape)
     posed = {}
-    for frame in sorted(set(frames)):
-        moves = joint_moves(joints, body.parents, np.asarray(rotations[frame], float))
-        blended = (skinning @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-        vertices = np.einsum("nrc,nc->nr", blended[..., :3], rest) + blended[..., 3] + translations[frame]
+    for frame in set(capture.frames.tolist()):
+        linear, offset = skinned(body, joints, capture, frame, skinning)
+        vertices = np.einsum("nrc,nc->nr", linear, rest[used]) + offset
         posed[frame] = np.einsum("pc,pcx->px", weights, vertices[corners])
     return posed
+
+
+def skinned(
+    body: BodyModel, joints: Float[np.ndarray, "j 3"], capture: Capture, frame: int, weights: Float[np.ndarray, "n j"]
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights. joints: of the rest pose."""
+    turns = Rotation.from_rotvec(np.asarray(capture.poses.rotations[frame], float)).as_matrix()
+    moves = np.zeros((len(joints), 3, 4))
+    for j, parent in enumerate(body.parents):  # parents come first
+        turn = turns[j] if parent < 0 else moves[parent, :, :3] @ turns[j]
+        place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
+        moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
+    blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
+    return blended[..., :3], blended[..., 3] + np.asarray(capture.poses.translation[frame], float)
 
 
 def points_in_image(
@@ -136,28 +141,6 @@ def _sampling(
     u, v = rng.random((2, count))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return faces[np.minimum(chosen, len(faces) - 1)], np.stack([1 - u - v, u, v], axis=-1)
-
-
-def joint_turns(rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3 3"]:
-    """Rotation matrices of axis-angles."""
-    angles = np.linalg.norm(rotations, axis=-1)
-    x, y, z = (rotations / np.maximum(angles, 1e-12)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    return np.eye(3) + sine * cross + (1 - cosine) * cross @ cross
-
-
-def joint_moves(
-    joints: Float[np.ndarray, "j 3"], parents: Sequence[int], rotations: Float[np.ndarray, "j 3"]
-) -> Float[np.ndarray, "j 3 4"]:
-    """Rigid transforms from the rest pose to the pose."""
-    local, moves = joint_turns(rotations), np.zeros((len(parents), 3, 4))
-    for j, parent in enumerate(parents):  # parents come first
-        turn = local[j] if parent < 0 else moves[parent, :, :3] @ local[j]
-        place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
-        moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
-    return moves
 
 
 # Displacement ----------------------------------------------------------------------------------------------------------
@@ -295,15 +278,12 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
         if i in unusable:
             continue
         if frame not in posed:
-            rotations = np.asarray(capture.poses.rotations[frame], float)
-            moves = joint_moves(joints, body.parents, rotations)
-            blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-            offset = blended[..., 3] + np.asarray(capture.poses.translation[frame], float)
+            linear, offset = skinned(body, joints, capture, frame, weights)
             if body.pose_directions is not None:
-                features = (joint_turns(rotations)[1:] - np.eye(3)).ravel()
-                correction = np.asarray(body.pose_directions) @ features
-                offset = offset + np.einsum("nab,nb->na", blended[..., :3], correction)
-            posed[frame] = blended[..., :3], offset
+                turns = Rotation.from_rotvec(np.asarray(capture.poses.rotations[frame], float)).as_matrix()
+                correction = np.asarray(body.pose_directions) @ (turns[1:] - np.eye(3)).ravel()
+                offset = offset + np.einsum("nab,nb->na", linear, correction)
+            posed[frame] = linear, offset
         K, matrix = np.asarray(capture.cameras.K[i], float), np.asarray(capture.cameras.cam_from_world[i], float)
         if all(np.isfinite(x).all() for x in (rest, *posed[frame])):  # whoever poses the body names what is not
             views.append(_window(mask, K @ matrix[:3], *posed[frame]))

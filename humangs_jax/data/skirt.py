@@ -23,9 +23,9 @@ from humangs_jax.data.body_and_masks import (
     Reach,
     at,
     empty_views,
-    joint_moves,
     masked_views,
     shaped,
+    skinned,
     to_edges,
 )
 from humangs_jax.data.capture import Capture
@@ -81,11 +81,9 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
     shares = np.arange(1, GAP + 1)[:, None] / (GAP + 1)
     asked, shown, clear = np.zeros((3, ROWS))
     cameras, empty = jax.tree.map(np.asarray, capture.cameras), empty_views(capture.masks)
-    rotations, translations = (np.asarray(x, float) for x in (capture.poses.rotations, capture.poses.translation))
     for i in [i for i in range(capture.view_count) if i not in empty]:
-        moves = joint_moves(joints, body.parents, rotations[capture.frames[i]])
-        posed = np.einsum("jab,jb->ja", moves[..., :3], joints) + moves[..., 3] + translations[capture.frames[i]]
-        axes = _along(posed, legs, levels)
+        linear, offset = skinned(body, joints, capture, int(capture.frames[i]), np.eye(len(joints)))
+        axes = _along(np.einsum("jab,jb->ja", linear, joints) + offset, legs, levels)
         between = (1 - shares) * axes[0][:, None] + shares * axes[1][:, None]
         project = cameras.K[i] @ cameras.cam_from_world[i, :3]
         points, sides = (x.reshape(-1, 3) @ project[:, :3].T + project[:, 3] for x in (between, axes))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from exr_files import camera_of, read_exr
 
-from humangs_jax.apps import demo
 from humangs_jax.apps.demo import run_demo
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.refinement.config import RefineConfig
@@ -96,35 +95,3 @@ def test_exr_agrees_with_itself(out):
 def test_the_avatar_can_be_loaded_again(out):
     avatar = Avatar.load(out / "avatar.npz")
     assert len(avatar.parents) == 55 and np.isfinite(avatar.gaussians.means).all()
-
-
-def test_an_interrupted_run_keeps_its_stages_and_the_same_call_goes_on(tmp_path, monkeypatch, capsys):
-    ran, stopped = [], ["animate"]
-
-    def stage_of(name):
-        def run(self, folder, timings):
-            ran.append(name)
-            (folder / f"{name}.png").write_text(name)
-            if name in stopped:
-                raise KeyboardInterrupt
-            timings[name] = {"seconds": 1.0}
-            return {"psnr": 20.0} if name == "reconstruct" else {}
-
-        return run
-
-    for name, method in {"reconstruct": "reconstruct", "refine": "refine_avatar", "animate": "animate", "write": "write"}.items():
-        monkeypatch.setattr(demo._Demo, method, stage_of(name))
-    run = lambda **options: run_demo(tmp_path / "out", **{"refine": RefineConfig(steps=3, seconds=None), **options})
-    with pytest.raises(KeyboardInterrupt):
-        run()
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["reconstruct.png", "refine.png", "report.json"]
-    stopped.clear()
-    ran.clear()
-    report = run()
-    assert ran == ["animate", "write"] and "going on after reconstruct, refine" in capsys.readouterr().out
-    assert set(report["timings"]) == {"reconstruct", "refine", "animate", "write"} and report["psnr"] == 20.0
-    assert json.loads((tmp_path / "out" / "report.json").read_text()) == report
-    for options in ({}, {"frame_size": 128}, {"refine": None}):  # finished, or other settings: from the beginning
-        ran.clear()
-        run(**options)
-        assert ran[0] == "reconstruct" and ("refine" in ran) is ("refine" not in options)

@@ -9,6 +9,7 @@ import pytest
 
 from experiments.render_tables import render_pages
 from experiments.results import blocks_of, json_text, publish, text_of
+from experiments.robustness import interval
 
 REPOSITORY = Path(__file__).parents[2]
 TABLE = "| run | PSNR | name |\n| --- | ---: | --- |\n| a | 1.0 | x |\n| b | 2.0 | y |"
@@ -83,3 +84,9 @@ def test_what_differs_is_reported_and_rendered(page):
     ]
     page.write_text(page.read_text() + "<!-- end -->\n")
     assert any("no docs/results/z.json" in fault for fault in render_pages(page.parents[1], write=False))
+
+
+def test_ends_are_where_the_loss_crosses_the_bound():
+    row = interval("focal length", {-2.0: 3.0, -1.0: 0.5, 1.0: 0.2, 2.0: 0.9})
+    assert row["low"] == pytest.approx(-1.2) and row["high"] is None
+    assert interval("body moved", {0.5: 0.0, 1.0: 2.0})["low"] == 0  # an error without a sign

@@ -6,7 +6,7 @@ import pytest
 from fit_people import NOISE, default_body, person
 
 from humangs_jax.apps import check as module
-from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet, plot_over_time
+from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet
 from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
@@ -310,7 +310,7 @@ def test_lines_lead_to_the_body(sheet):
 
 @pytest.mark.slow
 def test_many_views_and_frames(tmp_path, monkeypatch):
-    """An evenly chosen few of them, and a plot below."""
+    """An evenly chosen few of them."""
     monkeypatch.setattr(module, "LONGEST_SIDE", SIDE)
     capture, keypoints = person(31, 9, 3)
     keypoints.confidences[26] = 0
@@ -320,11 +320,8 @@ def test_many_views_and_frames(tmp_path, monkeypatch):
     overlays = []
     monkeypatch.setattr(module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((SIDE, SIDE, 3)))
     fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")
-    image, _ = read_image(tmp_path / "fit.png")
     assert len(overlays) == module.VIEWS == len(names) and names[0] == "m0v0" and names[-1] == "m8v2"
     assert np.diff(overlays).max() <= 2
-    plot = plot_over_time(examination.frames, image.shape[1])
-    np.testing.assert_allclose(image[-len(plot) :], plot, atol=1 / 255)
 
 
 @pytest.mark.slow
@@ -332,30 +329,3 @@ def test_labels(sheet):
     views = (ViewReport("a", 0, 17, 2.06, 4.0, 0.0), ViewReport("b", 0, 0, np.nan, np.nan, 0.0))
     examination = dataclasses.replace(sheet[1], report=FitReport("keypoints", views=views))
     assert [module._fit_label(examination, i) for i in (0, 1)] == ["a  2.1 px", "b  no keypoints"]
-
-
-def test_the_plot_rises_and_has_gaps():
-    errors = np.array([1.0, 1.0, 4.0, np.nan, 2.0, 2.0])
-    plot = plot_over_time(errors, 600)
-    blue = drawn(plot, LEFT)
-    row = lambda column: blue[np.abs(blue[:, 1] - column) <= 2, 0].mean()
-    columns = [30 + (580 - 30) * i / 5 for i in range(6)]
-    assert row(columns[2]) < row(columns[4]) < row(columns[0])  # rows count downwards
-    unit = (row(columns[0]) - row(columns[2])) / 3
-    assert row(columns[0]) - row(columns[4]) == pytest.approx(unit, abs=2)
-    between = (blue[:, 1] > columns[2] + 4) & (blue[:, 1] < columns[4] - 4)
-    assert not between.any()
-
-
-@pytest.mark.parametrize("errors", [[0.0, 0.0], [np.nan, np.nan], [np.nan, 3.0], [1e-6, 2e6]])
-def test_plots_of_extremes(errors):
-    plot = plot_over_time(np.asarray(errors), 300)
-    assert plot.shape == (module.LINES * module.SMALLEST_TEXT, 300, 3) and np.isfinite(plot).all()
-
-
-@pytest.mark.parametrize(
-    "highest, count, whole, ticks",
-    [(10.5, 4, False, [0, 5, 10]), (2.6, 4, False, [0, 1, 2]), (0.03, 4, False, [0, 0.01, 0.02, 0.03]), (1, 9, True, [0, 1])],
-)
-def test_ticks_are_round(highest, count, whole, ticks):
-    np.testing.assert_allclose(module._ticks(highest, count, whole), ticks)

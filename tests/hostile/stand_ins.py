@@ -23,6 +23,7 @@ import numpy as np
 from dataset_files import write_avatarrex, write_model
 from honest_files import bank_arrays, sphere, write_import
 
+from humangs_jax.apps.quick_check import Faults
 from humangs_jax.apps.settings import Cost, Tuned, load_front
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.library import load_body
@@ -196,7 +197,7 @@ def stand_ins(variant):
         return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
 
     def tuned(*_, **__):
-        return Tuned(load_front()[variant], Cost(variant, 0.0, 1.0), {})
+        return Tuned(load_front()[variant], Cost(variant, 0.0, 1.0), load_front()[variant], {})
 
     mesh_views = lambda *_: iter([(np.full((32, 32, 3), variant / 4), np.ones((32, 32)))] * 8)
     avatar = lambda *_, **__: Avatar.load(Path(os.environ["KILLS_INPUTS"]) / f"avatar{variant}.npz")
@@ -212,7 +213,7 @@ def stand_ins(variant):
         "avatar.layers.draw": lambda _, poses, *__: iter(some_renderings(variant, len(poses))),
         "detection.people.available": lambda: False,
         "apps.check._body_image": shown,
-        "apps.check.faults": lambda capture: ((), (SimpleNamespace(problem=None, inside=1.0),) * capture.view_count),
+        "apps.check.faults": lambda capture: Faults((), (None,) * capture.view_count, (1.0,) * capture.view_count, set()),
         "apps.check._posed_frames": lambda capture, *_: {0: np.zeros((4, 3))},
         "apps.demo.load_weights": lambda *_: (None, tiny()),
         "apps.demo.reconstruct": avatar,
@@ -223,7 +224,6 @@ def stand_ins(variant):
         "apps.demo.draw_painted_body": lambda *_: None,
         "apps.demo.motion_frames": frames,
         "apps.settings.tune": tuned,
-        "apps.settings.both_avatars": lambda *_: random_of(variant, 4).random((16, 32, 3)),
         "evaluation.run.score_views": scored,
         "fitting.fit_capture.fit_photos": fitted,
         "fitting.refine.refine_capture": refined,
