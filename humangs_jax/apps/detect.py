@@ -1,8 +1,7 @@
 """People in photos: found, the same one in all of them chosen, and written as keypoints, masks and a numbered sheet.
 
     keypoints.json   the chosen person, for `humangs fit`
-    people.json      everybody, numbered as on the sheet
-    people.png       the sheet
+    people.png       the sheet: everybody, with numbers
     masks/NAME.png   of the chosen person
 
 With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo,
@@ -10,29 +9,30 @@ and where several are of nearly one size, by the colors of their upper bodies an
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from humangs_jax.apps.start import photo_files
-from humangs_jax.core.array_types import Float, Int, UInt
+from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.data.masks import box_of
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
-from humangs_jax.fitting.triangulation import Match, Seen, in_order_of_time, match_colors, match_people
+from humangs_jax.fitting.triangulation import Seen, in_order_of_time, match_colors, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 
-KEYPOINTS_FILE, PEOPLE_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.json", "people.png", "masks"
+KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
 RIVAL = 0.35
 """Somebody with this share of the pixels of the largest person may be meant as well as he."""
 THUMBNAIL = 480
@@ -99,14 +99,31 @@ def person_in_capture(
     folder: Path, photos: Photos | Capture, keypoints: Keypoints | None = None, person: int | None = None
 ) -> tuple[list[PhotoPeople], int]:
     """The people in the photos of a capture folder, and the number of the one who is meant: by keypoints, if there are any, else
-    by the number asked for, else by masks, else by size. Raises: see `found_in_photos`, `person_of`, `chosen`.
+    by the number asked for, else by masks, else by size. Raises: see `found_in_photos`, `choose`; ValueError for keypoints or
+    masks of nobody.
     """
-    people = found_in_capture(folder)
-    if keypoints is not None:
-        return people, person_of(people, keypoints, folder)
-    if photos.masks is not None and person is None and len(people[0].people):
-        return people, person_on(people, photos.masks, folder)
-    return people, chosen(people, person, folder)
+    people, sheet = found_in_capture(folder), folder / SHEET_FILE
+    if keypoints is None and (photos.masks is None or person is not None or not people[0].people):
+        return people, choose(people, person, sheet)
+
+    def agreement(v: int, number: int) -> float:
+        mask = person_mask(people[v], number)
+        if keypoints is None:
+            return float(np.sum(photos.masks[v] * mask))
+        x, y = np.floor(keypoints.points[v]).astype(int).T
+        seen = (keypoints.confidences[v] > 0) & _inside(x, y, *mask.shape[::-1])
+        return float(np.sum(mask[y[seen], x[seen]]))
+
+    sums = [sum(agreement(v, i) for v in range(len(people))) for i in range(len(people[0].people))]
+    if max(sums, default=0.0) <= 0:
+        write_sheet(sheet, people)
+        given = "masks" if keypoints is None else "keypoints"
+        raise ValueError(f"the {given} are of nobody who was found in the photos: see {sheet}")
+    return people, int(np.argmax(sums))
+
+
+def _inside(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
@@ -142,9 +159,7 @@ def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 
 
 def _found(person: DetectedPerson, photo: Float[np.ndarray, "h w 3"]) -> Found:
     mask = sharpened(person.mask, photo, person.side / LANDMARK_SIZE)
-    rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
-    top, left = (int(each[0]) if len(each) else 0 for each in (rows, columns))
-    bottom, right = (int(each[-1]) + 1 if len(each) else 0 for each in (rows, columns))
+    (top, bottom), (left, right) = box_of(mask > 0).tolist()
     cut = to_uint8(mask[top:bottom, left:right])
     return Found(seen_person(person), cut, (top, left), float((cut > 255 * SEEN).sum()))
 
@@ -203,7 +218,7 @@ def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n
         for k, part in enumerate(PARTS):
             a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
             x, y = np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
-            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            inside = _inside(x, y, width, height)
             if inside.any():
                 found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
     return found
@@ -215,26 +230,18 @@ def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
 
 
 def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[list[Found | None]]:
+    K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
+    points = [tuple(each.person.points for each in photo.people if each is not None) for photo in photos]
     times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
-    matches = [match_people([_seen(photos[v], cameras, int(v)) for v in own], MEDIAPIPE_33.mirror) for own in times]
+    matches = [match_people([Seen(K[v], transforms[v], points[v]) for v in own], MEDIAPIPE_33.mirror) for own in times]
     rows: list[list[Found | None]] = [[] for _ in photos]
     for own, people in zip(times, in_order_of_time(matches), strict=True):
         for match in people:
             for i, v in enumerate(own):
-                rows[v].append(_member(photos[v], match, i))
+                found = None if match is None or (member := match.members[i]) is None else photos[v].people[member]
+                mirrored = found is not None and match is not None and match.mirrored[i]
+                rows[v].append(exchanged(found) if mirrored else found)
     return rows
-
-
-def _seen(photo: PhotoPeople, cameras: Camera, view: int) -> Seen:
-    K, transform = (np.asarray(x[view], np.float64) for x in (cameras.K, cameras.cam_from_world))
-    return Seen(K, transform, tuple(each.person.points for each in photo.people if each is not None))
-
-
-def _member(photo: PhotoPeople, match: Match | None, i: int) -> Found | None:
-    if match is None or (member := match.members[i]) is None:
-        return None
-    found = photo.people[member]
-    return exchanged(found) if found is not None and match.mirrored[i] else found
 
 
 def exchanged(found: Found) -> Found:
@@ -247,9 +254,18 @@ def exchanged(found: Found) -> Found:
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
     """The number of the person that is meant: the one asked for, or the only one who is large.
 
-    Arguments: sheet: where the numbers can be looked up.
+    Arguments: sheet: where the numbers can be looked up; it is written where this cannot be decided.
     Raises: ValueError if no photo has a person, or not so many, if several may be meant, or if it is unclear who is who.
     """
+    try:
+        return _chosen(photos, person, sheet)
+    except ValueError:
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        write_sheet(sheet, photos)
+        raise
+
+
+def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
     count = len(photos[0].people)
     if not count:
         raise ValueError(f"no person in {few([photo.name for photo in photos])}: expected one who is seen as a whole")
@@ -270,40 +286,9 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     return person or 0
 
 
-def person_on(photos: Sequence[PhotoPeople], masks: Float[np.ndarray, "v h w"], folder: Path) -> int:
-    """The number of the person whom masks of the photos show. Raises: ValueError if they show none of the people."""
-    return _best(photos, lambda v, mask: float(np.sum(masks[v] * mask)), "masks", folder)
-
-
-def person_of(photos: Sequence[PhotoPeople], keypoints: Keypoints, folder: Path) -> int:
-    """The number of the person on whom keypoints of the photos lie. Raises: ValueError if they lie on none of the people."""
-
-    def inside(v: int, mask: Float[np.ndarray, "h w"]) -> float:
-        height, width = mask.shape
-        x, y = np.floor(keypoints.points[v]).astype(int).T
-        seen = (keypoints.confidences[v] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        return float(np.sum(mask[y[seen], x[seen]]))
-
-    return _best(photos, inside, "keypoints", folder)
-
-
-def _best(photos: Sequence[PhotoPeople], agreement: Callable[[int, np.ndarray], float], given: str, folder: Path) -> int:
-    count = len(photos[0].people)
-    sums = [sum(agreement(v, person_mask(p, i)) for v, p in enumerate(photos) if p.people[i] is not None) for i in range(count)]
-    if max(sums, default=0.0) <= 0:
-        write_sheet(folder / SHEET_FILE, photos)
-        raise ValueError(f"the {given} are of nobody who was found in the photos: see {folder / SHEET_FILE}")
-    return int(np.argmax(sums))
-
-
-def absent(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
-    """Names of the photos without the person."""
-    return tuple(photo.name for photo in photos if photo.people[person] is None)
-
-
 def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     """What should be known about the photos of a person, a line each."""
-    told = [f"{name}: the person was not found in it" for name in absent(photos, person)]
+    told = [f"{photo.name}: the person was not found in it" for photo in photos if photo.people[person] is None]
     if any(photo.colors for photo in photos):
         told.insert(0, f"several people in a photo: number {person} is the same by the colors of upper body and legs alone")
     found = [(photo, each) for photo in photos if (each := photo.people[person]) is not None]
@@ -316,44 +301,29 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     return told + [f"{photo.name}: {mirrored}" for photo, each in found if each.mirrored]
 
 
-def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path, sheet: Path | None = None) -> int:
-    """As `choose`; where it cannot be decided, the sheet is in the folder, or where `sheet` says."""
-    sheet = folder / SHEET_FILE if sheet is None else sheet
-    try:
-        return choose(photos, person, sheet)
-    except ValueError:
-        sheet.parent.mkdir(parents=True, exist_ok=True)
-        write_sheet(sheet, photos)
-        raise
-
-
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
 def write_found(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
-    """Keypoints and masks of a person, everybody's file and the sheet, into a folder; all or nothing.
+    """Keypoints and masks of a person, and the sheet, into a folder; all or nothing.
 
     Raises: ValueError if two photos have the same name but for the suffix.
     """
-    owners: dict[Path, str] = {}
-    for photo in photos:
-        file = mask_file(Path(), photo.name)
-        if file in owners:
-            raise ValueError(f"{owners[file]} and {photo.name}: both masks would be {file.as_posix()}: rename one")
-        owners[file] = photo.name
+    files = [mask_file(Path(), photo.name) for photo in photos]
+    if several := [photo.name for photo, file in zip(photos, files, strict=True) if files.count(file) > 1]:
+        raise ValueError(f"{' and '.join(several)}: masks would have one name: rename all but one")
 
     def write(temporary: Path) -> None:
         _write_people(temporary, photos, person)
-        for photo in photos:
-            file = mask_file(temporary, photo.name)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_png(file, person_mask(photo, person))
+        for photo, file in zip(photos, files, strict=True):
+            (temporary / file).parent.mkdir(parents=True, exist_ok=True)
+            write_png(temporary / file, person_mask(photo, person))
 
     add_files(folder, write)
 
 
 def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, masks: bool) -> None:
-    """Keypoints, everybody's file and the sheet into the capture folder whose photos these are; masks: the masks, too."""
+    """Keypoints and the sheet into the capture folder whose photos these are; masks: the masks, too."""
     description = read_description(folder / "capture.json")
     files = [mask_file(Path(), photo.name).as_posix() for photo in photos]
     views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
@@ -370,8 +340,9 @@ def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, 
 
 
 def _write_people(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
-    write_people(folder / KEYPOINTS_FILE, _images(photos, [person]))
-    write_people(folder / PEOPLE_FILE, _images(photos, range(len(photos[0].people))))
+    shown = [(photo, photo.people[person]) for photo in photos]
+    images = [ImagePeople(photo.name, photo.size, (None if each is None else each.person,)) for photo, each in shown]
+    write_people(folder / KEYPOINTS_FILE, images)
     write_sheet(folder / SHEET_FILE, photos, person)
 
 
@@ -389,21 +360,16 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
     return mask
 
 
-def _images(photos: Sequence[PhotoPeople], numbers: Sequence[int]) -> list[ImagePeople]:
-    people = lambda photo: tuple(None if (found := photo.people[i]) is None else found.person for i in numbers)
-    return [ImagePeople(photo.name, photo.size, people(photo)) for photo in photos]
-
-
 def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
     """The photos side by side, everybody in a color and with a number. person: the one who was chosen."""
     from humangs_jax.avatar.video import contact_sheet
 
     pictures = [_picture(photo, person) for photo in photos]
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
-    padded = [
-        np.pad(each, ((0, height - each.shape[0]), (0, width - each.shape[1]), (0, 0)), constant_values=1.0) for each in pictures
-    ]
-    contact_sheet(np.stack(padded), path, labels=[photo.name for photo in photos])
+    padded = np.ones((len(photos), height, width, 3))
+    for sheet, picture in zip(padded, pictures, strict=True):
+        sheet[: picture.shape[0], : picture.shape[1]] = picture
+    contact_sheet(padded, path, labels=[photo.name for photo in photos])
 
 
 def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3"]:
@@ -423,12 +389,6 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     canvas = Image.fromarray(to_uint8(picture))
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
     for x, y, i in heads:
-        pen.text(
-            (x, y),
-            f"{i}?" if photo.unclear else str(i),
-            fill="white",
-            stroke_width=3,
-            stroke_fill=COLORS[i % len(COLORS)],
-            font=font,
-        )
+        number = f"{i}?" if photo.unclear else str(i)
+        pen.text((x, y), number, fill="white", stroke_width=3, stroke_fill=COLORS[i % len(COLORS)], font=font)
     return np.asarray(canvas) / 255

@@ -58,7 +58,7 @@ def import_photos(
     with tempfile.TemporaryDirectory() as place:
         if reduce and (smaller := _reduced(images, files, Path(place))):
             found = _look(Path(place), files, smaller, person, out)
-            if min(np.ptp(each.person.points[:, :2], axis=0).max() for each in found.people) >= LEAST_PERSON:
+            if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
                 return _written(found, Path(place), out, height, None, own_masks)
     return _written(_look(images, files, files, person, out), images, out, height, masks, own_masks)
 
@@ -79,12 +79,11 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
 
 
 class _Looked(NamedTuple):
-    """photos: all of them. shown: those with the person `number`. people: of these. seen: of these."""
+    """photos: all of them. shown: those with the person `number`. seen: of these."""
 
     photos: list[PhotoPeople]
     number: int
     shown: list[int]
-    people: list[detect.Found]
     seen: PersonViews
 
 
@@ -92,7 +91,7 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | 
     names = [file.relative_to(images).as_posix() for file in looked_at]
     photos = detect.same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
     # beside `out`, which a refusal leaves as it is
-    number = detect.chosen(photos, person, out, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
+    number = detect.choose(photos, person, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
     known = ((focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size)) for i in shown)
@@ -106,28 +105,26 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | 
         focal=np.asarray(focal),
         photos=tuple(names[i] for i in shown),
     )
-    return _Looked(photos, number, shown, people, seen)
+    return _Looked(photos, number, shown, seen)
 
 
 def _written(
     looked: _Looked, images: Path, out: Path, height: float | None, masks: Path | None, own_masks: bool
 ) -> PhotosImported:
-    photos, number, shown, _, seen = looked
+    photos, number, shown, seen = looked
     found = cameras_from_person(seen, height=height)
-    calibration = _calibration(seen, found, images)
-    report = import_calibration(calibration, images, out, masks=masks)
-    used = [
-        _repaired(photos[shown[view]], number, bool(mirrored)) for view, mirrored in zip(found.views, found.mirrored, strict=True)
-    ]
+    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks)
     views = read_description(out / "capture.json")["views"]
-    size = (report.width, report.height)
-    padded = [
-        dataclasses.replace(photo, name=f"{Path(view['image']).stem}.png", size=size)
-        for photo, view in zip(used, views, strict=True)
-    ]
-    detect.add_to_capture(out, padded, number, masks=own_masks)
+    written = []
+    for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):
+        photo, people = photos[shown[view]], list(photos[shown[view]].people)
+        if mirrored and (person := people[number]) is not None:
+            people[number] = detect.exchanged(person)
+        name, size = f"{Path(described['image']).stem}.png", (report.width, report.height)  # padded
+        written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
+    detect.add_to_capture(out, written, number, masks=own_masks)
     warnings = (*found.warnings, *report.checks.warnings)
-    return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(used))
+    return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(written))
 
 
 def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calibration:
@@ -154,14 +151,6 @@ def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calib
     )
 
 
-def _repaired(photo: PhotoPeople, number: int, mirrored: bool) -> PhotoPeople:
-    """The photo, with left and right of the person changed back."""
-    people = list(photo.people)
-    if mirrored and (found := people[number]) is not None:
-        people[number] = detect.exchanged(found)
-    return dataclasses.replace(photo, people=tuple(people))
-
-
 def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tuple[str, ...]:
     centers = np.asarray([camera.center for camera in found.cameras], float)
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))
@@ -172,8 +161,9 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
         which = f"{count} photos of one moment: one pose"
     else:
         which = f"{count} photos of several moments: the person has a pose of its own in each, and one shape"
-    diagonals = [np.hypot(*seen.sizes[view]) for view in found.views]
-    focal = np.median([float(camera.K[0, 0]) for camera in found.cameras] / np.asarray(diagonals))
+    focal = np.median(
+        [float(c.K[0, 0]) / np.hypot(*seen.sizes[view]) for view, c in zip(found.views, found.cameras, strict=True)]
+    )
     return (
         f"{report.out}: {which}",
         f"cameras from the person: {distance:.1f} m away, {DIAGONAL_35MM * focal:.0f} mm (35-mm equivalent); "

@@ -5,7 +5,7 @@ person an avatar is where no photo was.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,7 +43,7 @@ MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
 """Names that are looked for in the folder of photos, in this order; those of files: `data.formats`."""
 KEYPOINT_FOLDER = "keypoints"
-OWN_DETECTOR = ("pip install 'humangs_jax[photos]', and the same command finds them; or with another program:",)
+OWN_DETECTOR = "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
 """For masks and keypoints: said where LiteRT is not installed."""
 
 
@@ -141,50 +141,35 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
     if material.cameras is None:
         workspace = folder / "colmap"
         model = workspace / "sparse" / "0"
-        found.append(
-            Missing(
-                "cameras",
-                "where each photo was taken from, and its lens",
-                (
-                    "many overlapping photos of someone who stands still, with COLMAP (https://colmap.github.io):",
-                    f"  mkdir {workspace} && colmap automatic_reconstructor --workspace_path {workspace}"
-                    f" --image_path {material.images} --single_camera 1 --dense 0",
-                    f"  colmap model_converter --input_path {model} --output_path {model} --output_type TXT",
-                    "  its unit is arbitrary: measure something, and add --scale METRES_PER_UNIT",
-                    "few cameras that stand still: calibrate them with a checkerboard, in OpenCV or EasyMocap;",
-                    f"  put calibration.json, or intri.yml and extri.yml, into {folder} (docs/cameras.md)",
-                ),
-            )
+        how = (
+            "many overlapping photos of someone who stands still, with COLMAP (https://colmap.github.io):",
+            f"  mkdir {workspace} && colmap automatic_reconstructor --workspace_path {workspace}"
+            f" --image_path {material.images} --single_camera 1 --dense 0",
+            f"  colmap model_converter --input_path {model} --output_path {model} --output_type TXT",
+            "  its unit is arbitrary: measure something, and add --scale METRES_PER_UNIT",
+            "few cameras that stand still: calibrate them with a checkerboard, in OpenCV or EasyMocap;",
+            f"  put calibration.json, or intri.yml and extri.yml, into {folder} (docs/cameras.md)",
         )
+        found.append(Missing("cameras", "where each photo was taken from, and its lens", how))
     if material.masks is None and not material.alpha:
-        found.append(
-            Missing(
-                "masks",
-                "what of each photo is the person",
-                (
-                    *OWN_DETECTOR,
-                    'rembg: pip install "rembg[cpu,cli]"',
-                    f"  rembg p -m u2net_human_seg -om {material.images} {folder / 'masks'}",
-                    "where it takes something else for the person: SAM 2 (https://github.com/facebookresearch/sam2)",
-                    "photos with nothing but white behind the person: --without-masks",
-                ),
-            )
+        how = (
+            OWN_DETECTOR,
+            'rembg: pip install "rembg[cpu,cli]"',
+            f"  rembg p -m u2net_human_seg -om {material.images} {folder / 'masks'}",
+            "where it takes something else for the person: SAM 2 (https://github.com/facebookresearch/sam2)",
+            "photos with nothing but white behind the person: --without-masks",
         )
+        found.append(Missing("masks", "what of each photo is the person", how))
     if material.keypoints is None:
         source, target = images or material.images, folder / "keypoints"
-        found.append(
-            Missing(
-                "keypoints",
-                "where shoulders, knees and fingers are, for `humangs fit`",
-                (
-                    *OWN_DETECTOR,
-                    "RTMPose, in a checkout of MMPose (https://github.com/open-mmlab/mmpose):",
-                    f"  python demo/inferencer_demo.py {source} --pose2d wholebody --pred-out-dir {target}",
-                    "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",
-                    f"  openpose.bin --image_dir {source} --write_json {target} --hand --display 0 --render_pose 0",
-                ),
-            )
+        how = (
+            OWN_DETECTOR,
+            "RTMPose, in a checkout of MMPose (https://github.com/open-mmlab/mmpose):",
+            f"  python demo/inferencer_demo.py {source} --pose2d wholebody --pred-out-dir {target}",
+            "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",
+            f"  openpose.bin --image_dir {source} --write_json {target} --hand --display 0 --render_pose 0",
         )
+        found.append(Missing("keypoints", "where shoulders, knees and fingers are, for `humangs fit`", how))
     return tuple(found)
 
 
@@ -204,23 +189,6 @@ MARK = "video.json"
 """In the folder of photos: the video that they are of."""
 
 
-@dataclasses.dataclass(frozen=True)
-class VideoPhotos:
-    """folder: of the photos. chosen: numbers of the frames, from 0. count: of all frames of the video."""
-
-    video: Path
-    folder: Path
-    chosen: tuple[int, ...]
-    count: int
-
-    def __str__(self) -> str:
-        frames = ", ".join(map(str, self.chosen))
-        return (
-            f"{self.video}: {len(self.chosen)} of {self.count:,} frames, sharp ones that show different things ({frames}), "
-            f"are the photos in {self.folder / 'images'}; what is to be added goes into {self.folder}"
-        )
-
-
 def video_of(place: Path) -> Path | None:
     """The video that `place` is, or that is in a folder without photos; None if there is none.
 
@@ -237,8 +205,8 @@ def video_of(place: Path) -> Path | None:
     return next(iter(videos.values()))
 
 
-def photos_of_video(video: Path, folder: Path) -> VideoPhotos:
-    """Write the chosen frames into `folder / "images"`; a folder that an earlier run wrote of this video stays as it is.
+def photos_of_video(video: Path, folder: Path) -> str:
+    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run wrote of this video stays.
 
     Raises: CaptureError naming the video, or the folder if something else is there.
     """
@@ -250,7 +218,7 @@ def photos_of_video(video: Path, folder: Path) -> VideoPhotos:
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
             problem = f"exists, and is not of {video.name} as it is now: expected another folder, or remove it"
             raise CaptureError(folder, "", problem)
-        return VideoPhotos(video, folder, tuple(known["chosen"]), known["frames"])
+        return _chosen(video, folder, known["chosen"], known["frames"])
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
     with reading(video, "video", CaptureError):
         chosen = choose_frames(sharpness, thumbnails, PHOTOS)
@@ -260,7 +228,14 @@ def photos_of_video(video: Path, folder: Path) -> VideoPhotos:
         write_json(place / MARK, {**of_video, "frames": len(sharpness), "chosen": chosen})
 
     replace_folder(folder, write, mark=MARK)
-    return VideoPhotos(video, folder, tuple(chosen), len(sharpness))
+    return _chosen(video, folder, chosen, len(sharpness))
+
+
+def _chosen(video: Path, folder: Path, chosen: Sequence[int], count: int) -> str:
+    return (
+        f"{video}: {len(chosen)} of {count:,} frames, sharp ones that show different things ({', '.join(map(str, chosen))}), "
+        f"are the photos in {folder / 'images'}; what is to be added goes into {folder}"
+    )
 
 
 # A held-out photo -----------------------------------------------------------------------------------------------------

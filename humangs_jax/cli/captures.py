@@ -61,7 +61,7 @@ class Detect:
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
     out: Annotated[Path, Place()]
-    """Folder for keypoints.json, masks/, people.png (the sheet) and people.json (everybody)."""
+    """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
     """Which person, by the number on people.png. Default: the one who is largest."""
 
@@ -71,7 +71,7 @@ class Detect:
 
         with stage("finding people"):
             photos = detect.found_in_photos(self.photos)
-        person = detect.chosen(photos, self.person, self.out)
+        person = detect.choose(photos, self.person, self.out / detect.SHEET_FILE)
         with stage("writing"):
             detect.write_found(self.out, photos, person)
         tell_found(photos, person)

@@ -182,9 +182,9 @@ class Start:
             return self.photos
         out = self.out if self.out.name not in ("", "..") else self.out.resolve()
         with stage("choosing frames of the video"):
-            frames = photos_of_video(video, out.with_name(f"{out.name}_photos"))
-        tell(frames)
-        return frames.folder
+            told = photos_of_video(video, folder := out.with_name(f"{out.name}_photos"))
+        tell(told)
+        return folder
 
     def _resumes(self) -> bool:
         """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""

@@ -108,22 +108,6 @@ def test_leaving_the_loop_ends_all_threads():
     assert not left
 
 
-@given(st.integers(1, 4), st.integers(1, 3), st.integers(0, 50))
-@settings(deadline=None, max_examples=20)
-def test_processes_together_make_the_batch_of_one(process_count, share, step):
-    size = process_count * share
-    whole = Loader(CountingSource(), size, seed=1)
-    parts = [Loader(CountingSource(), size, seed=1, process_index=i, process_count=process_count) for i in range(process_count)]
-    assert [row for part in parts for row in part.rows] == list(range(size))
-    together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *[part.batch_at(step) for part in parts])
-    assert same(together, whole.batch_at(step))
-
-
-def test_a_batch_that_cannot_be_divided_is_refused():
-    with pytest.raises(ValueError, match="batch of 3 cannot be divided among 2 processes"):
-        Loader(CountingSource(), 3, process_count=2)
-
-
 SHARDED = """
 import jax, json, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec

@@ -9,11 +9,9 @@ batches that are asked for next. Threads suffice: decoding and jitted functions 
 import collections
 import concurrent.futures
 import dataclasses
-import queue
-import threading
+import itertools
 import time
-from collections.abc import Callable, Generator, Iterator
-from typing import TypeVar
+from collections.abc import Generator
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +23,6 @@ from humangs_jax.data.loading.examples import Example, Mixture, Source, ViewSamp
 
 __all__ = ["CaptureCache", "CaptureSource", "Example", "Loader", "Mixture", "PeopleCache", "Source", "ViewSampling"]
 
-T = TypeVar("T")
-
-THREAD_NAME = "humangs-loader"
 AHEAD = 2
 """Batches prepared while one is worked on."""
 
@@ -56,10 +51,7 @@ class Loader:
     sharding: how a batch lies on the devices (only its first axis may be split); a process makes the rows that its own
         devices hold, so that replicas hold equal rows. None: everything on the default device.
     first_step, first_example: where the numbering of examples starts: those of steps before had other batches.
-    process_index, process_count: where `sharding` is None, the part of the batch to make: equal runs of rows.
     threads: that make examples.
-
-    Raises: ValueError if the batch cannot be divided among the processes.
     """
 
     source: Source
@@ -68,23 +60,13 @@ class Loader:
     sharding: jax.sharding.Sharding | None = None
     first_step: int = 0
     first_example: int = 0
-    process_index: int = 0
-    process_count: int = 1
     threads: int = 4
-
-    def __post_init__(self):
-        if self.batch_size % self.process_count or not 0 <= self.process_index < self.process_count:
-            raise ValueError(
-                f"a batch of {self.batch_size} cannot be divided among {self.process_count} processes "
-                f"(this is {self.process_index})"
-            )
 
     @property
     def rows(self) -> tuple[int, ...]:
         """Rows of the global batch that this process makes."""
         if self.sharding is None:
-            share = self.batch_size // self.process_count
-            return tuple(range(self.process_index * share, (self.process_index + 1) * share))
+            return tuple(range(self.batch_size))
         parts = self.sharding.addressable_devices_indices_map((self.batch_size,)).values()
         return tuple(sorted({row for part in parts if part is not None for row in range(self.batch_size)[part[0]]}))
 
@@ -113,25 +95,31 @@ class Loader:
     def batches(self, start: int, stop: int, waiting: Waiting | None = None) -> Generator[tuple[int, Example], None, None]:
         """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
 
-        Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
+        Errors of the threads are raised here, in their turn. Closing the generator (or leaving the loop over it) ends them.
         waiting: the time that the loop waited for batches is added to it.
         """
+        rows, begun = self.rows, collections.deque[list[concurrent.futures.Future]]()
+        pools = (concurrent.futures.ThreadPoolExecutor(count, "humangs-loader") for count in (self.threads, 1))
+        with next(pools) as readers, next(pools) as placer:
 
-        def make():
-            rows = self.rows
-            examples = read_in_order(
-                lambda i: self.example_at(start + i // len(rows), rows[i % len(rows)]),
-                (stop - start) * len(rows),
-                self.threads,
-                AHEAD * len(rows),
-            )
+            def begin(step: int) -> None:
+                examples = [readers.submit(self.example_at, step, row) for row in rows]
+                begun.append([placer.submit(lambda: self._place([each.result() for each in examples])), *examples])
+
             try:
+                for step in range(start, min(start + AHEAD, stop)):
+                    begin(step)
                 for step in range(start, stop):
-                    yield step, self._place([next(examples) for _ in rows])
+                    if step + AHEAD < stop:
+                        begin(step + AHEAD)
+                    began = time.perf_counter()
+                    batch = begun.popleft()[0].result()
+                    if waiting is not None:
+                        waiting.add(time.perf_counter() - began)
+                    yield step, batch
             finally:
-                examples.close()
-
-        return prefetched(make, AHEAD, waiting)
+                for future in itertools.chain(*begun):
+                    future.cancel()
 
     def _place(self, examples: list[Example]) -> Example:
         """Stack the rows of this process and put them on the devices."""
@@ -155,77 +143,3 @@ def _stack(*leaves: Array | np.ndarray) -> Array | np.ndarray:
     """Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
-
-
-# Threads --------------------------------------------------------------------------------------------------------------
-
-
-def prefetched(make: Callable[[], Iterator[T]], ahead: int, waiting: Waiting | None = None) -> Generator[T, None, None]:
-    """The items of the iterator that `make()` returns, up to `ahead` of them prepared by a thread.
-
-    The iterator is used and closed in the thread. Its errors are raised here. Closing the generator (or leaving the
-    loop over it) ends the thread. waiting: the time that the loop waited is added to it.
-    """
-    ready: queue.Queue = queue.Queue(maxsize=max(1, ahead))
-    stopped = threading.Event()
-
-    def put(item):
-        while not stopped.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-                return
-            except queue.Full:
-                continue
-
-    def produce():
-        iterator = None
-        try:
-            iterator = make()
-            for item in iterator:
-                if stopped.is_set():
-                    return
-                put((item, None, False))
-            put((None, None, True))
-        except BaseException as error:  # the error is raised in the loop
-            put((None, error, True))
-        finally:
-            close = getattr(iterator, "close", None)
-            if close is not None:
-                close()
-
-    thread = threading.Thread(target=produce, name=THREAD_NAME, daemon=True)
-    thread.start()
-    try:
-        while True:
-            began = time.perf_counter()
-            item, error, last = ready.get()
-            if error is not None:
-                raise error
-            if last:
-                return
-            if waiting is not None:
-                waiting.add(time.perf_counter() - began)
-            yield item
-    finally:
-        stopped.set()
-        thread.join()
-
-
-def read_in_order(make: Callable[[int], T], count: int, threads: int, ahead: int) -> Generator[T, None, None]:
-    """make(0), make(1), ..., make(count - 1), up to `ahead` of them started before they are needed.
-
-    Raises: what `make` raises, in its turn.
-    """
-    threads, ahead = max(1, threads), max(1, ahead, threads)
-    with concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="humangs-reader") as pool:
-        pending = collections.deque(pool.submit(make, i) for i in range(min(ahead, count)))
-        begun = len(pending)
-        try:
-            while pending:
-                yield pending.popleft().result()
-                if begun < count:
-                    pending.append(pool.submit(make, begun))
-                    begun += 1
-        finally:
-            for future in pending:
-                future.cancel()

@@ -159,8 +159,7 @@ class PeopleCache:
         self.people = tuple(people)
         self.broken: dict[Path | str, str] = {}
         self._free_bytes = limit_bytes
-        self._left_out: set[Path | str] = set()
-        self._summaries: dict[Path | str, StoredSubject] = {}
+        self._summaries: dict[Path | str, StoredSubject | None] = {}  # None: left out
         self._images: dict[tuple[Path | str, int], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
@@ -175,8 +174,6 @@ class PeopleCache:
         """Person `index` without images, see `StoredPerson`; None if it is broken, which is reported once."""
         name = self.name(index)
         with self._lock:
-            if name in self._left_out:
-                return None
             if name in self._summaries:
                 return self._summaries[name]
         try:
@@ -220,9 +217,9 @@ class PeopleCache:
         """
         self.note(index, problem)
         with self._lock:
-            self._left_out.add(self.name(index))
-            count = len(self._left_out)
-        if count == len({person.name for person in self.people}):
+            self._summaries[self.name(index)] = None
+            nobody = all(person.name in self._summaries and self._summaries[person.name] is None for person in self.people)
+        if nobody:
             raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
 
     def _keep(self, name: Path | str, view: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> None:
@@ -243,8 +240,7 @@ class CaptureCache(PeopleCache):
     def __init__(
         self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30, body_file: str | Path = DEFAULT_BODY
     ):
-        self.folders = tuple(Path(folder) for folder in folders)
-        super().__init__([CaptureFolder(folder, body, body_file) for folder in self.folders], limit_bytes)
+        super().__init__([CaptureFolder(Path(folder), body, body_file) for folder in folders], limit_bytes)
 
 
 @dataclasses.dataclass(frozen=True)
