@@ -109,6 +109,7 @@ def person_in_capture(
     def agreement(v: int, number: int) -> float:
         mask = person_mask(people[v], number)
         if keypoints is None:
+            assert photos.masks is not None
             return float(np.sum(photos.masks[v] * mask))
         x, y = np.floor(keypoints.points[v]).astype(int).T
         seen = (keypoints.confidences[v] > 0) & _inside(x, y, *mask.shape[::-1])

@@ -220,7 +220,8 @@ class Cost:
     def worst(self, other: "Cost") -> "Cost":
         """The larger one of each."""
         pairs = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
-        return Cost(*(None if None in pair else max(pair) for pair in pairs))
+        largest: list[Any] = [None if None in pair else max(pair) for pair in pairs]
+        return Cost(*largest)
 
 
 @dataclasses.dataclass(frozen=True)

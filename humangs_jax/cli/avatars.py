@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -436,7 +436,7 @@ class Tune:
     """Network weights (.safetensors). Default: the shipped ones."""
 
     def run(self) -> None:
-        budgets = {"reconstruct_ms": self.reconstruct_ms, "frame_ms": self.frame_ms, "memory_mb": self.memory_mb}
+        budgets: dict[str, Any] = {"reconstruct_ms": self.reconstruct_ms, "frame_ms": self.frame_ms, "memory_mb": self.memory_mb}
         if all(value is None for value in budgets.values()):
             raise UsageError("--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them")
         for name, value in budgets.items():
