@@ -1,7 +1,6 @@
 """Who is compared with what: people from captures or a `Source`, and the methods that predict their views, the simplest last."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -250,20 +249,18 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
     Raises: ValueError for one avatar and several people; OSError.
     """
-    if not isinstance(avatar, Avatar) and Path(avatar).is_dir():
-        folder = Path(avatar)
+    folder = None if isinstance(avatar, Avatar) else Path(avatar)
+    if folder is None or not folder.is_dir():
+        if people != 1:
+            raise ValueError(f"one avatar for {people} people: expected a folder with PERSON.npz for each")
+        loaded = avatar if isinstance(avatar, Avatar) else Avatar.load(avatar)
+        return lambda case, background: draw_views(loaded, case.truth, background)
 
-        def one_of(case: Case, background: float) -> Predicted:
-            file = folder / f"{case.name}.npz"
-            if not file.is_file():
-                return _nothing(case, (str(file),))
-            return draw_views(Avatar.load(file), case.truth, background)
+    def one_of(case: Case, background: float) -> Predicted:
+        file = folder / f"{case.name}.npz"
+        return draw_views(Avatar.load(file), case.truth, background) if file.is_file() else _nothing(case, (str(file),))
 
-        return one_of
-    if people != 1:
-        raise ValueError(f"one avatar for {people} people: expected a folder with PERSON.npz for each")
-    loaded = avatar if isinstance(avatar, Avatar) else Avatar.load(avatar)
-    return lambda case, background: draw_views(loaded, case.truth, background)
+    return one_of
 
 
 def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
@@ -329,12 +326,6 @@ def _nothing(case: Case, missing: tuple[str, ...]) -> Predicted:
     return Predicted(case.truth.images[:0], None, (), missing)
 
 
-@functools.cache
-def shipped_weights() -> tuple[Variables, HumanGSConfig]:
-    """The network that comes with the package."""
-    return load_weights()
-
-
 def choose_method(
     people: int,
     avatar: str | Path | Avatar | None = None,
@@ -354,10 +345,10 @@ def choose_method(
         return Path(predictions).name, predictions_method(predictions, people)
     if method is not None:
         return getattr(method, "__name__", "method"), method
+    if weights is None:
+        return "shipped weights", weights_method(*load_weights())
     if isinstance(weights, str | Path):
         return Path(weights).name, weights_method(*load_weights(weights))
-    if weights is None:
-        return "shipped weights", weights_method(*shipped_weights())
     return "weights", weights_method(*weights)
 
 
@@ -368,7 +359,7 @@ def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
     size = (inputs.cameras.width, inputs.cameras.height)
 
     def view(frame, camera):
-        vertices = _posed_vertices(inputs, rest, frame)
+        vertices = _posed(body, rest, inputs.pose(frame))
         pixels, depths = project_vertices(camera, vertices)
         depth_map = rasterize_mesh(vertices, body.faces, camera).depth
         return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
@@ -384,16 +375,12 @@ def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.n
     rest = shape_body(body, jnp.asarray(views.betas))
 
     def draw(frame: int, camera: Camera):
-        fragments = rasterize_mesh(_posed_vertices(views, rest, frame), body.faces, camera)
+        fragments = rasterize_mesh(_posed(body, rest, views.pose(frame)), body.faces, camera)
         return np.asarray(interpolate_attributes(fragments, body.faces, colors, jnp.ones(3)))
 
     return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
 
 
-def _posed_vertices(capture: Capture, rest: RestBody, frame: int) -> Float[Array, "n 3"]:
-    return _pose(capture.body, rest, capture.pose(frame))
-
-
 @jax.jit
-def _pose(body: BodyModel, rest: RestBody, pose: BodyPose) -> Float[Array, "n 3"]:
+def _posed(body: BodyModel, rest: RestBody, pose: BodyPose) -> Float[Array, "n 3"]:
     return pose_body(body, rest, pose).vertices

@@ -32,11 +32,11 @@ from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
 from humangs_jax.evaluation.scores import (
     CONFIDENCE,
+    PROTOCOLS,
     EvaluationProtocol,
     Mean,
     Row,
     Scored,
-    find_protocol,
     missing_reasons,
     on_background,
     overall_means,
@@ -83,13 +83,10 @@ COLUMNS = {
     "iou": Column("IoU", 4, "up"),
     "semi_transparent": Column("semi_transparent", 4, "down"),
     "foreground": Column("share of the person", 3, ""),
-    "patch_psnr": Column("PSNR of patches", 2, "up"),
-    "patch_ssim": Column("SSIM of patches", 4, "up"),
-    "patch_lpips_vgg": Column("LPIPS vgg of patches", 4, "down"),
-    "patch_lpips_alex": Column("LPIPS alex of patches", 4, "down"),
-    "patch_lpips_squeeze": Column("LPIPS squeeze of patches", 4, "down"),
     "patches": Column("patches", 1, ""),
 }
+_OF_PATCHES = ("psnr", "ssim", "lpips_vgg", "lpips_alex", "lpips_squeeze")
+COLUMNS |= {f"patch_{x}": COLUMNS[x]._replace(heading=f"{COLUMNS[x].heading} of patches") for x in _OF_PATCHES}
 
 
 class Gallery:
@@ -99,19 +96,15 @@ class Gallery:
 
     def __init__(self, limit: int) -> None:
         self.inputs: dict[str, list[str]] = {}
-        self._limit = limit
+        self.limit = limit
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
     def add(self, row: int, psnr: float | None, images: Callable[[], dict[str, str]]) -> None:
         """An image, see `_shot`; row: its number among the rows."""
         key = 0.0 if psnr is None else -psnr
-        if len(self._shots) >= self._limit and (not self._shots or key <= self._shots[0][0]):
+        if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
             return
-        (heapq.heappushpop if len(self._shots) >= self._limit else heapq.heappush)(self._shots, (key, row, images()))
-
-    def small_inputs(self, images: Float[np.ndarray, "v h w 3"]) -> list[str]:
-        """What the method saw of a person, if a page is made."""
-        return [_data_url(image, INPUT_SIDE) for image in images] if self._limit else []
+        (heapq.heappushpop if len(self._shots) >= self.limit else heapq.heappush)(self._shots, (key, row, images()))
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
@@ -304,13 +297,13 @@ def evaluate(
         Scores by image, person and mean; `write` makes files of them.
 
     Raises:
-        ValueError: one line: unknown protocol, nothing to compare, sizes that differ.
+        ValueError: one line: nothing to compare, sizes that differ. KeyError: no such protocol.
         OSError: for files that cannot be read.
 
     Examples:
         >>> hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
     """
-    rules = find_protocol(protocol)
+    rules = PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
     networks = {network.net: network for network in lpips}
     networks |= {net: load_lpips(net) for net in rules.lpips if net not in networks and net in installed_lpips()}
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
@@ -318,14 +311,8 @@ def evaluate(
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
     kept = None if keep is None else Path(keep)
     if kept is not None:
-        said = {
-            "name": name,
-            "protocol": repr(rules),
-            "people": len(people.names),
-            "lpips": sorted(networks),
-            "images": page_images,
-        }
-        begin_set(kept, SCORES, {SETTINGS: said})
+        said = {"name": name, "protocol": repr(rules), "people": len(people.names)}
+        begin_set(kept, SCORES, {SETTINGS: said | {"lpips": sorted(networks), "images": page_images}})
     rows, missing, scored, gallery = [], [], [], Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
         file = None if kept is None else kept / f"person_{index}.json"
@@ -369,7 +356,7 @@ def _score_person(
     about: dict[str, Any] = {"missing": [printable(file) for file in predicted.missing], "rows": [], "shots": []}
     if not predicted.views:
         return about
-    truth = case.truth.select(predicted.views)
+    truth, inputs = case.truth.select(predicted.views), case.inputs
     try:
         scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
     except ValueError as error:
@@ -385,8 +372,8 @@ def _score_person(
         "masks": truth.masks is not None,
         "alpha": predicted.alpha is not None,
         "side": truth.images.shape[2:0:-1],
-        "inputs": None if case.inputs is None else case.inputs.view_count,
-        "input_images": [] if case.inputs is None else gallery.small_inputs(case.inputs.images),
+        "inputs": None if inputs is None else inputs.view_count,
+        "input_images": [_data_url(image, INPUT_SIDE) for image in inputs.images] if inputs and gallery.limit else [],
     }
 
 

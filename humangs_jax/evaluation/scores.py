@@ -11,6 +11,7 @@ count, and LPIPS sees zeros where its convolutions would.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -90,16 +91,11 @@ class SquareBox:
         """See `Crop`."""
         from skimage.transform import resize
 
-        rows, columns = box_of(mask > 0)
-        (top, bottom), (left, right) = (
-            np.clip([first - self.margin, end - 1 + self.margin], 0, side)
-            for (first, end), side in zip((rows, columns), mask.shape, strict=True)
-        )
-        part = image[top:bottom, left:right]
+        rows, columns = (slice(max(0, first - self.margin), end - 1 + self.margin) for first, end in box_of(mask > 0))
+        part = image[rows, columns]
         largest = max(part.shape[:2])
-        square = np.full((largest, largest, 3), background, np.float32)
-        down, across = ((largest - side) // 2 for side in part.shape[:2])
-        square[down : down + part.shape[0], across : across + part.shape[1]] = part
+        missing = [((largest - side) // 2, (largest - side + 1) // 2) for side in part.shape[:2]]
+        square = np.pad(part.astype(np.float32), [*missing, (0, 0)], constant_values=background)
         return resize(square, (self.side, self.side), order=1, mode="edge", anti_aliasing=False).astype(np.float32)
 
 
@@ -152,10 +148,14 @@ class EvaluationProtocol:
         return 0.0 if self.background == "black" else 1.0
 
     @property
+    def crops(self) -> tuple[Crop, ...]:
+        """What PSNR and SSIM see first, what LPIPS sees last."""
+        return (self.crop,) if self.lpips_crop is None else (self.crop, self.lpips_crop)
+
+    @property
     def needs_masks(self) -> bool:
         """Whether it is not defined without the true masks."""
-        crops = (self.crop, self.lpips_crop or self.crop)
-        return self.masked or self.background == "black" or any(not isinstance(crop, WholeFrame) for crop in crops)
+        return self.masked or self.background == "black" or not all(isinstance(crop, WholeFrame) for crop in self.crops)
 
 
 PROTOCOLS: Presets[EvaluationProtocol] = Presets(
@@ -170,15 +170,6 @@ PROTOCOLS: Presets[EvaluationProtocol] = Presets(
     }
 )
 """By the name of the system whose paper reports such numbers; docs/evaluation.md has them as a table."""
-
-
-def find_protocol(protocol: str | EvaluationProtocol) -> EvaluationProtocol:
-    """A protocol by name, or the one given. Raises: ValueError for an unknown name."""
-    if isinstance(protocol, EvaluationProtocol):
-        return protocol
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[protocol]
 
 
 # Means: first over the images of a frame, then over the frames of a person, then over people: a person counts once, however often
@@ -224,23 +215,21 @@ def known_means(rows: Sequence[Row]) -> Row:
     return {name: sum(values) / len(values) if values else None for name, values in known.items()}
 
 
-def grouped(rows: Iterable[tuple[Any, Row]]) -> dict[Any, list[Row]]:
-    """Scores by a key, in the order of first appearance."""
+def _means_by(rows: Iterable[tuple[Any, Row]]) -> dict[Any, Row]:
+    """`known_means` of the rows that share a key, in the order of first appearance."""
     groups: dict[Any, list[Row]] = {}
     for key, row in rows:
         groups.setdefault(key, []).append(row)
-    return groups
+    return {key: known_means(found) for key, found in groups.items()}
 
 
 def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
-    """Scores by person and frame."""
-    return {key: known_means(images) for key, images in grouped(((r.person, r.frame), r.scores) for r in rows).items()}
+    return _means_by(((row.person, row.frame), row.scores) for row in rows)
 
 
 def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
     """Scores by person: means over the images of a frame, then over frames."""
-    frames = _frame_means(rows)
-    return {key: known_means(found) for key, found in grouped((who, row) for (who, _), row in frames.items()).items()}
+    return _means_by((person, row) for (person, _), row in _frame_means(rows).items())
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
@@ -357,18 +346,15 @@ def score_image(
     predicted, window, row = np.clip(predicted, 0, 1), protocol.ssim, dict.fromkeys(score_names(protocol))
     if protocol.masked and mask is not None:
         predicted = predicted * mask[..., None] + protocol.behind * (1 - mask[..., None])
-    for crop, names in ((protocol.crop, ("psnr", "ssim")), (protocol.lpips_crop or protocol.crop, protocol.lpips)):
+    for crop in protocol.crops:
         if empty and not isinstance(crop, WholeFrame):
             continue
-        cut = lambda image, crop=crop: image if mask is None else crop.cut(image, mask, protocol.behind)
-        pair = [cut(image) for image in (predicted, truth)]
+        pair = [image if mask is None else crop.cut(image, mask, protocol.behind) for image in (predicted, truth)]
         size, least = jnp.asarray(pair[0].shape[:2]), min(pair[0].shape[:2])
         pair = [_padded(image) for image in pair]
-        if names is not protocol.lpips:
-            if least >= window.size:
-                row |= pair_scores(*pair, size, window)
-            continue
-        for net in protocol.lpips:
+        if crop is protocol.crops[0] and least >= window.size:
+            row |= pair_scores(*pair, size, window)
+        for net in protocol.lpips if crop is protocol.crops[-1] else ():
             if net in networks and least >= smallest_side(BACKBONES[net]):
                 row[f"lpips_{net}"] = _lpips(networks[net], *pair, size)
     if mask is not None:
@@ -472,5 +458,5 @@ def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
     if truth.masks is None:
         raise ValueError("the foreground PSNR needs a mask for every view")
     means = mean_scores(score_views(predicted, truth))
-    values = {field.name: means[field.name] for field in dataclasses.fields(Scores)}
-    return Scores(**{name: float("nan") if value is None else value for name, value in values.items()})
+    values = (means[field.name] for field in dataclasses.fields(Scores))
+    return Scores(*(math.nan if value is None else value for value in values))

@@ -63,8 +63,8 @@ class Ablation:
         cells = [
             [row.name, str(row.seeds), f"{row.mean:.2f}", *(_shown(row) if row.name != BASE else ("", ""))] for row in self.rows
         ]
-        lines = text_table([head, *cells])
-        return "\n".join([*lines, f"{self.missing} runs are missing: the budget was used up"][: len(lines) + bool(self.missing)])
+        missing = [f"{self.missing} runs are missing: the budget was used up"] if self.missing else []
+        return "\n".join([*text_table([head, *cells]), *missing])
 
     def plot(self) -> Any:
         """Differences to the base with their intervals; gray where the interval contains 0.
@@ -72,9 +72,8 @@ class Ablation:
         Raises: ImportError without matplotlib, which the extra `notebooks` installs.
         """
         rows = [row for row in self.rows if row.name != BASE][::-1]
-        figure = importlib.import_module("matplotlib.figure").Figure(
-            figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained"
-        )
+        make = importlib.import_module("matplotlib.figure").Figure
+        figure = make(figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained")
         axis = figure.add_subplot()
         for place, row in enumerate(rows):
             color = "tab:blue" if row.clear else "0.6"
@@ -147,15 +146,14 @@ def ablate(
     for name, seed in bar(order, desc="ablate", unit="run", shown=progress):
         folder = Path(out) / re.sub(r"[^\w.+-]+", "_", name) / str(seed)
         start = time.monotonic()
-        finished = _score(folder, metric, base.steps) is not None
-        if seconds is not None and not finished and start - began + longest > seconds:
+        if seconds is not None and not _validated(folder, base.steps) and start - began + longest > seconds:
             continue
         config = dataclasses.replace(runs[name], seed=seed)
         train(config, body, learned, folder, validation=compared, networks=networks, progress=progress)
-        score = _score(folder, metric, config.steps)
-        if score is None:
-            raise ArgumentError("metric", f"{metric!r}: is none of validation: {_metrics(folder)}")
-        scores[name][seed] = score
+        found = _validated(folder, config.steps)
+        if metric not in found:
+            raise ArgumentError("metric", f"{metric!r}: is none of validation: {', '.join(sorted(found))}")
+        scores[name][seed] = found[metric]
         longest = max(longest, time.monotonic() - start)
     result = Ablation(metric, scores, sum(seeds - len(own) for own in scores.values()))
     if progress:
@@ -193,16 +191,9 @@ def _source(people: People, body: BodyModel, config: TrainConfig, split: str) ->
     return on_the_fly_people(build_bank(seeds_of(split, 0, people), body, split, texture_size=texture))
 
 
-def _lines(folder: Path) -> list[dict[str, Any]]:
+def _validated(folder: Path, step: int) -> dict[str, float]:
+    """What the validation after that step found; empty if there was none."""
     file = folder / "log.jsonl"
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
-
-
-def _score(folder: Path, metric: str, step: int) -> float | None:
-    """Of the validation after that step; None if there was none."""
-    found = [line[f"val_{metric}"] for line in _lines(folder) if line.get("step") == step and f"val_{metric}" in line]
-    return float(found[-1]) if found else None
-
-
-def _metrics(folder: Path) -> str:
-    return ", ".join(sorted({name[4:] for line in _lines(folder) for name in line if name.startswith("val_")}))
+    lines = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    numbers = [item for line in lines if line.get("step") == step for item in line.items()]
+    return {name.removeprefix("val_"): value for name, value in numbers if name.startswith("val_")}

@@ -13,6 +13,7 @@ import contextlib
 import dataclasses
 import json
 import logging
+import operator
 import zlib
 from collections.abc import Generator
 from pathlib import Path
@@ -45,15 +46,12 @@ class Checkpoints:
         import orbax.checkpoint as ocp
         from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
-        def score(metrics):
-            return metrics["score"]
-
-        self._ocp = ocp
+        folder, self._ocp, self._read_only = Path(folder).resolve(), ocp, read_only
+        score = operator.itemgetter("score")
         kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
         options = ocp.CheckpointManagerOptions(
             best_fn=score, preservation_policy=kept, enable_async_checkpointing=True, create=not read_only, read_only=read_only
         )
-        folder, self._read_only = Path(folder).resolve(), read_only
         if unreadable := _without_score(folder):
             if read_only:
                 raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
@@ -183,27 +181,20 @@ def _checksum(state: TrainState) -> str:
 def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
     data = np.asarray(shard.data)
     words = data.reshape(-1).view(f"u{data.itemsize}").astype(np.uint64)
-    places = np.zeros(data.shape, np.uint64)
-    stride = 1
-    for axis in reversed(range(data.ndim)):
-        start = shard.index[axis].start or 0
-        along = (np.arange(data.shape[axis], dtype=np.uint64) + np.uint64(start)) * np.uint64(stride)
-        places += along.reshape([-1 if i == axis else 1 for i in range(data.ndim)])
-        stride *= shape[axis]
-    return int(((2 * places.reshape(-1) + 1) * words).sum(dtype=np.uint64))
+    axes = [np.arange(size) + (part.start or 0) for size, part in zip(data.shape, shard.index, strict=True)]
+    places = np.ravel_multi_index(np.ix_(*axes), shape).reshape(-1) if shape else np.zeros(1)
+    return int(((2 * places.astype(np.uint64) + 1) * words).sum(dtype=np.uint64))
 
 
 def _without_score(folder: Path) -> list[Path]:
     """Checkpoints whose score cannot be read; Orbax would stop at the first of them."""
     found = []
-    for step in folder.glob("[0-9]*"):
-        if step.name.isdecimal() and step.is_dir():
-            try:
-                score = read_json(step / "metrics" / "metrics")["score"]
-                found += [] if isinstance(score, int | float) else [step]
-            except (OSError, ValueError, LookupError, TypeError):
-                found.append(step)
-    return sorted(found)
+    for step in sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()):
+        try:
+            float(read_json(step / "metrics" / "metrics")["score"])
+        except (OSError, ValueError, LookupError, TypeError):
+            found.append(step)
+    return found
 
 
 def _set_aside(steps: list[Path]) -> None:
@@ -230,9 +221,8 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
         longer = {"steps"} if finished and now["steps"] > earlier["steps"] else set()
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE) - longer):
             if earlier.get(name) != now.get(name):
-                raise ValueError(
-                    f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another folder"
-                )
+                other = f"{name} = {earlier.get(name)}, not {now.get(name)}"
+                raise ValueError(f"{path}: this run was started with {other}: use another folder")
     if write:
         write_text(path, config_to_json(config, indent=1))
 

@@ -19,6 +19,7 @@ from humangs_jax.core.configuration import (
     Steps,
     configuration,
     knob,
+    vary,
 )
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.io.reading import read_configuration
@@ -66,6 +67,13 @@ class Stage:
     batch_size: Few | None = None
 
 
+STAGED = {
+    "image_size": "model.conventions.image_size", "token_capacity": "model.runtime.token_capacity",
+    "target_size": "target_size", "batch_size": "batch_size",
+}  # fmt: skip
+"""What the fields of a stage change in a `TrainConfig`."""
+
+
 @configuration
 class TrainConfig:
     """One run. Photos enter at `model.conventions.image_size` pixels.
@@ -106,7 +114,7 @@ class TrainConfig:
         if self.model.runtime.dtype == "float16":
             raise ValueError("model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training")
         starts = [stage.start for stage in self.stages]
-        if starts and (starts != sorted(set(starts)) or starts[-1] >= self.steps):
+        if starts != sorted(set(starts)) or starts[-1:] >= [self.steps]:
             raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")
         for start in starts:
             self.at(start)
@@ -116,14 +124,14 @@ class TrainConfig:
         config = dataclasses.replace(self, stages=())
         for stage in self.stages:
             if stage.start <= step:
-                config = _changed(config, stage)
+                changes = {path: getattr(stage, name) for name, path in STAGED.items()}
+                config = vary(config, {path: value for path, value in changes.items() if value is not None})
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
         """(first, end) of the runs of steps between two steps during which the configuration stays the same."""
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
-        edges = [start, *inner, stop]
-        return list(itertools.pairwise(edges)) if start < stop else []
+        return list(itertools.pairwise([start, *inner, stop])) if start < stop else []
 
     def examples_before(self, step: int) -> int:
         """Subjects that the steps before this one have taken, over all stages."""
@@ -135,24 +143,11 @@ def compiled_for(config: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, **HOST_SETTINGS)
 
 
-def _changed(config: TrainConfig, stage: Stage) -> TrainConfig:
-    model = config.model
-    if stage.image_size is not None:
-        model = model.with_conventions(image_size=stage.image_size)
-    if stage.token_capacity is not None:
-        model = model.with_runtime(token_capacity=stage.token_capacity)
-    own = {"target_size": stage.target_size, "batch_size": stage.batch_size}
-    return dataclasses.replace(config, model=model, **{name: x for name, x in own.items() if x is not None})
-
-
 def small() -> TrainConfig:
     """For the shipped network: some hours on a CPU of two cores. Its present weights had other losses (assets/weights.md)."""
-    against_semi_transparency = LossConfig(
-        squared=0.5, absolute=0.15, silhouette=0.0, boundary=0.1, depth=0.3, distortion=1.0, opaque=0.001
-    )
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
-        loss=against_semi_transparency,
+        loss=LossConfig(squared=0.5, absolute=0.15, silhouette=0.0, boundary=0.1, depth=0.3, distortion=1.0, opaque=0.001),
         augmentation=Augmentation(share=0.4),
         optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
@@ -233,10 +228,7 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
     if not missing:
         return config
     structural = max(config.loss.structural, LossConfig().structural)
-    logger.warning(
-        "no network is given for the loss %s, so it is replaced by structural dissimilarity (weight %g)",
-        " and ".join(missing),
-        structural,
-    )
+    replaced = "no network is given for the loss %s, so it is replaced by structural dissimilarity (weight %g)"
+    logger.warning(replaced, " and ".join(missing), structural)
     loss = dataclasses.replace(config.loss, **dict.fromkeys(missing, 0.0), structural=structural)
     return dataclasses.replace(config, loss=loss)

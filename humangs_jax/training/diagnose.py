@@ -1,8 +1,5 @@
 """Finds the stage of a training step in which numbers stopped being finite.
 
-    print(diagnose_step(state, batch, body, config))       # one step
-    print(diagnose_run("runs/small", load_body(), people)) # the first step of a run that failed
-
 Stages are the modules of the network, by their path, and the steps beside it that are a `parts.stage`. An interceptor of Linen
 keeps what they return, and adds zeros to what they take and return: the gradients with respect to these zeros are those that pass
 back there.
@@ -25,7 +22,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Key, PyTree, Scalar
-from humangs_jax.core.progress import bar, watched
+from humangs_jax.core.progress import bar, text_table, watched
 from humangs_jax.core.pytree import inexact_leaves, pytree_dataclass, static_field
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import gaussian_body
@@ -65,17 +62,11 @@ class Leaf:
     def of(cls, name: str, array: np.ndarray) -> "Leaf":
         """The numbers of an array."""
         wrong = ~np.isfinite(array.astype(np.promote_types(array.dtype, np.float32), copy=False))
-        bad = int(np.count_nonzero(wrong))
-        finite = (array[~wrong] if bad else array.reshape(-1)).astype(np.float64)
-        return cls(
-            name=name,
-            bad=bad,
-            first=tuple(int(i) for i in np.unravel_index(int(np.argmax(wrong)), array.shape)) if bad else (),
-            smallest=float(np.min(finite, initial=np.inf)),
-            largest=float(np.max(finite, initial=-np.inf)),
-            mean=float(np.mean(np.abs(finite))) if finite.size else 0.0,
-            norm=float(np.linalg.norm(finite)),
-        )
+        finite = array[~wrong].astype(np.float64)
+        first = tuple(np.argwhere(wrong)[0].tolist()) if wrong.any() else ()
+        mean = float(np.abs(finite).mean()) if finite.size else 0.0
+        extremes = float(finite.min(initial=np.inf)), float(finite.max(initial=-np.inf))
+        return cls(name, int(wrong.sum()), first, *extremes, mean, float(np.linalg.norm(finite)))
 
 
 @pytree_dataclass
@@ -107,12 +98,11 @@ def _first_bad(leaves: dict[str, Leaf]) -> Leaf | None:
     return next((leaf for leaf in leaves.values() if leaf.bad), None)
 
 
-def stored_report(name: str, tree: PyTree) -> StageReport:
-    """Of the arrays of a state or a batch."""
-    return numbers(StageReport(name, dict(inexact_leaves(tree))))
+def _stored(name: str, tree: PyTree) -> StageReport:
+    return _numbers(StageReport(name, dict(inexact_leaves(tree))))
 
 
-def numbers(report: StageReport) -> StageReport:
+def _numbers(report: StageReport) -> StageReport:
     """A report of arrays as one of `Leaf`s."""
     of = lambda arrays: {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
     return StageReport(report.name, *map(of, (report.values, report.taken, report.returned, report.gradients)))
@@ -141,7 +131,7 @@ class Diagnosis:
     """The diagnosis of one subject of a step: the first with a fault, or else the one with the largest gradient.
 
     step: steps done before it. stored: what the step began with, state and batch. stages: in the order in which they end.
-    skip_norm: gradients longer than this are skipped. `str` of it is a report.
+    skip_norm: gradients longer than this are skipped.
     """
 
     step: int
@@ -160,15 +150,10 @@ class Diagnosis:
     def faults(self) -> tuple[Fault, ...]:
         """All that was stored and is not finite; then the first stage to blame, going forward or else going back."""
         stored = [Fault("stored", part.name, leaf) for part in self.stored for leaf in part.values.values() if leaf.bad]
-        return (*stored, *self._computed())
-
-    def _computed(self) -> list[Fault]:
-        for stage in self.stages:
-            if leaf := _first_bad(stage.values):
-                return [Fault("forward", stage.name, leaf)]
-        found = [stage for stage in self.stages if stage.spoils]
-        inner = [stage for stage in found if not any(other.name.startswith(f"{stage.name}.") for other in found)]
-        return [Fault("backward", stage.name, stage.spoils) for stage in inner[-1:] if stage.spoils]
+        forward = [Fault("forward", stage.name, leaf) for stage in self.stages if (leaf := _first_bad(stage.values))]
+        back = [Fault("backward", stage.name, leaf) for stage in self.stages if (leaf := stage.spoils)]
+        inner = [fault for fault in back if not any(other.stage.startswith(f"{fault.stage}.") for other in back)]
+        return (*stored, *(forward[:1] or inner[-1:]))
 
     @property
     def fault(self) -> Fault | None:
@@ -192,18 +177,13 @@ class Diagnosis:
     def __str__(self) -> str:
         title = f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
         rows = [("stage", "values: bad", "smallest", "largest", "mean |x|", "sent back: bad", "parameters: bad", "norm")]
+        bad = lambda leaves: str(sum(leaf.bad for leaf in leaves.values())) if leaves else ""
         for report in (*self.stored, *self.stages):
-            values, sent, own = (list(x.values()) for x in (report.values, report.taken, report.gradients))
-            bad = lambda leaves: str(sum(leaf.bad for leaf in leaves)) if leaves else ""
-            of = lambda combine, field, leaves=values: (
-                f"{combine([getattr(leaf, field) for leaf in leaves]):.3g}" if leaves else ""
-            )
-            numbers = of(min, "smallest"), of(max, "largest"), of(np.mean, "mean")
-            norm = f"{report.gradient_norm:.3g}" if own else ""
-            rows.append((report.name, bad(values), *numbers, bad(sent), bad(own), norm))
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        align = lambda row: [row[0].ljust(widths[0]), *(x.rjust(w) for x, w in zip(row[1:], widths[1:], strict=True))]
-        return "\n".join([title, self.verdict, "", *("  ".join(align(row)).rstrip() for row in rows)])
+            leaves, columns = report.values.values(), ((min, "smallest"), (max, "largest"), (np.mean, "mean"))
+            numbers = [f"{of([getattr(x, name) for x in leaves]):.3g}" if leaves else "" for of, name in columns]
+            norm = f"{report.gradient_norm:.3g}" if report.gradients else ""
+            rows.append((report.name, bad(report.values), *numbers, bad(report.taken), bad(report.gradients), norm))
+        return "\n".join([title, self.verdict, "", *text_table(rows)])
 
 
 class Recorder:
@@ -219,7 +199,6 @@ class Recorder:
         self._probes = probes
 
     def __call__(self, run: Callable, arguments: tuple, named: dict, context: nn.module.InterceptorContext) -> Any:
-        """Run a method, watched if it is a stage."""
         module, (first, *others) = context.module, arguments
         if isinstance(module, Watched):
             if not module.apart:
@@ -235,7 +214,6 @@ class Recorder:
         return self.watch(path, lambda first: run(first, *others, **named), first)
 
     def watch(self, stage: str, function: Callable, *learned: Any) -> Any:
-        """function(*learned), recorded."""
         result = self._probed(stage, 1, function(*self._probed(stage, 0, learned)))
         self.given[stage] = dict(inexact_leaves(result))
         return result
@@ -295,15 +273,14 @@ def diagnose_step(
         "averaged parameters": state.ema_params,
         "loss networks": networks,
     }
-    stored = [stored_report(name, tree) for name, tree in parts.items() if jax.tree.leaves(tree)]
+    stored = [_stored(name, tree) for name, tree in parts.items() if jax.tree.leaves(tree)]
     keys = subject_keys(seed_numbers(config.seed), state.step, len(batch.inputs.betas))
     found = []
     for subject, key in enumerate(bar(keys, desc="diagnose", unit="subject", shown=watched())):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
         loss, stages = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
-        given = (*stored, stored_report("batch", example))
-        limit, reports = config.optimizer.skip_norm, tuple(map(numbers, stages))
-        found.append(Diagnosis(step, subject, float(loss), limit, given, reports))
+        given, reports = (*stored, _stored("batch", example)), tuple(map(_numbers, stages))
+        found.append(Diagnosis(step, subject, float(loss), config.optimizer.skip_norm, given, reports))
         if found[-1].fault is not None:
             return found[-1]
     return max(found, key=lambda diagnosis: diagnosis.gradient_norm)
@@ -333,18 +310,16 @@ def diagnose_run(
     if before:
         state = checkpoints.restore(state, before[-1])
     checkpoints.close()
-    step = int(state.step)
-    steps = 1 if failed is None else failed + 1 - step
-    repeated = bar(total=steps - 1, desc="repeat", unit="step", shown=watched() and steps > 1)
-    for first, last in config.spans(step, step + steps):
-        part, loader = config.at(first), stage_loader(make_source, config, first)
-        for step, batch in loader.batches(first, last):
-            if step + 1 < (last if failed is None else failed + 1):
-                state, _ = train_step(state, batch, body, part, networks)
-                repeated.update(1)
-            else:
+    begin = int(state.step)
+    target = begin if failed is None else failed
+    repeated = bar(total=target - begin, desc="repeat", unit="step", shown=watched() and target > begin)
+    for first, last in config.spans(begin, target + 1):
+        for step, batch in stage_loader(make_source, config, first).batches(first, last):
+            if step == target:
                 repeated.close()
                 return diagnose_step(state, batch, body, config, networks)
+            state, _ = train_step(state, batch, body, config.at(first), networks)
+            repeated.update(1)
     raise AssertionError("the last of the steps is diagnosed")
 
 
@@ -353,8 +328,5 @@ def first_failed_step(log: Path) -> int | None:
     if not log.is_file():
         return None
     with reading(log, "log"):
-        for line in read_text(log).splitlines():
-            record = parse_json(line)
-            if record.get("event") in FAILED:
-                return int(record["step"]) - 1
-        return None
+        records = map(parse_json, read_text(log).splitlines())
+        return next((int(record["step"]) - 1 for record in records if record.get("event") in FAILED), None)

@@ -52,6 +52,8 @@ logger = logging.getLogger("humangs_jax.training")
 FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
 """Number of consecutive steps that is reported if all were skipped, or all had a gradient of 0."""
+ALL_SKIPPED = "were skipped: `humangs train --diagnose` names the first stage that fails"
+NO_GRADIENT = "had a gradient of 0: no loss depends on a parameter any more; a learning rate that is too high does that"
 
 
 class RunLog:
@@ -97,10 +99,8 @@ class RunLog:
         if broken:
             numbers["broken_folders"] = broken
         self.numbers(done, numbers, "train")
-        shown = {"loss": f"{numbers['loss']:.4f}", "psnr": f"{numbers['psnr']:.2f}"}
-        if "samples_per_second" in numbers:
-            shown["samples/s"] = f"{numbers['samples_per_second']:.2f}"
-        self.bar.set_postfix(shown, refresh=False)
+        digits = {"loss": 4, "psnr": 2, "samples_per_second": 2}
+        self.bar.set_postfix({name: f"{numbers[name]:.{n}f}" for name, n in digits.items() if name in numbers}, refresh=False)
 
     def numbers(self, done: int, numbers: dict[str, float], group: str) -> None:
         """Numbers after a step, as a line and as curves "group/name"."""
@@ -153,22 +153,19 @@ class Watch:
         self._counts = counts
         self._in_a_row = self._in_a_row + 1 if skipped else 0
         self._without_gradient = self._without_gradient + 1 if numbers["grad_norm"] == 0 else 0
-        if self._without_gradient == MANY_SKIPPED:
-            advice = "no loss depends on a parameter any more; a learning rate that is too high does that"
-            self._log.event(done, "stuck", f"{MANY_SKIPPED} steps in a row had a gradient of 0: {advice}")
         if skipped or replaced:
             samples = bad_samples()
             text = "; ".join([f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}", *samples])
-            event = "skipped" if skipped else "nonfinite"
-            what = f"skipped ({text}), {counts[0]} so far"
-            if not skipped:
-                what = f"gradient entries that were not finite were replaced ({text})"
-            self._log.event(done, event, what, **numbers, **({"samples": samples} if samples else {}))
+            what = f"gradient entries that were not finite were replaced ({text})"
+            if skipped:
+                what = f"skipped ({text}), {counts[0]} so far"
+            details = numbers | ({"samples": samples} if samples else {})
+            self._log.event(done, "skipped" if skipped else "nonfinite", what, **details)
             if samples and jax.process_index():  # whose log is not written
                 logger.warning("step %d: %s", done, text)
-        if self._in_a_row == MANY_SKIPPED:
-            advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
-            self._log.event(done, "stuck", advice)
+        for count, problem in ((self._in_a_row, ALL_SKIPPED), (self._without_gradient, NO_GRADIENT)):
+            if count == MANY_SKIPPED:
+                self._log.event(done, "stuck", f"{MANY_SKIPPED} steps in a row {problem}")
 
 
 def forget_after(path: Path, step: int) -> None:
@@ -278,91 +275,75 @@ def train(
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
     with only_writer(out) if leading else contextlib.nullcontext():
-        return _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress)
+        save_config(out, config, write=leading)
+        of = lambda people: captured_people(people, body) if isinstance(people, Sequence) else people
+        make_source, unseen = of(training), of(validation) if validation else None
+        body = gaussian_body(body, config.model)
 
+        mesh = training_mesh(fsdp)
+        mesh = None if mesh.size == 1 else mesh
+        state, own_networks, own_body = init_state(config, variables), networks, body
+        if mesh is not None:
+            state = place(state, state_shardings(state, mesh))
+            body, networks = place((body, networks), replicated(mesh))
+        checkpoints = Checkpoints(out / "checkpoints", config.keep_checkpoints)
+        best = None
+        if checkpoints.steps:
+            state, best_step = checkpoints.restore(state), checkpoints.best_step
+            best = None if best_step is None else checkpoints.score(best_step)
+        begin, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
 
-def _train(
-    config: TrainConfig,
-    body: BodyModel,
-    training: Sequence[str | Path] | MakeSource,
-    out: Path,
-    leading: bool,
-    validation: Sequence[str | Path] | MakeSource,
-    variables: Variables | None,
-    networks: LossNetworks,
-    fsdp: int | None,
-    stop_at: int | None,
-    progress: bool,
-) -> TrainState:
-    save_config(out, config, write=leading)
-    of = lambda people: captured_people(people, body) if isinstance(people, Sequence) else people
-    make_source, unseen = of(training), of(validation) if validation else None
-    body = gaussian_body(body, config.model)
+        for first, _ in config.spans(begin, end)[1:]:
+            _rehearse(make_source, config, first, state, body, networks, mesh)
 
-    mesh = training_mesh(fsdp)
-    mesh = None if mesh.size == 1 else mesh
-    state, own_networks, own_body = init_state(config, variables), networks, body
-    if mesh is not None:
-        state = place(state, state_shardings(state, mesh))
-        body, networks = place((body, networks), replicated(mesh))
-    checkpoints = Checkpoints(out / "checkpoints", config.keep_checkpoints)
-    best = None
-    if checkpoints.steps:
-        state, best_step = checkpoints.restore(state), checkpoints.best_step
-        best = None if best_step is None else checkpoints.score(best_step)
-    begin, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
-
-    for first, _ in config.spans(begin, end)[1:]:
-        _rehearse(make_source, config, first, state, body, networks, mesh)
-
-    waiting = Waiting()
-    with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
-        watch, stop = Watch(log, state), False
-        for first, last in config.spans(begin, end):
-            part = config.at(first)
-            loader = stage_loader(make_source, config, first, mesh)
-            examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
-            batches = loader.batches(first, last, waiting=waiting)
-            for step, batch in batches:
-                if step == first and mesh is None:  # costs nothing: once, and the arrays are in memory
-                    for line in bad_samples(loader, step, batch):
-                        log.event(step, "sample", line, samples=[line])
-                with stage("compiling the step") if step == first else contextlib.nullcontext():
-                    state, metrics = train_step(state, batch, body, part, networks, mesh)
-                watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
-                stop = stopping(done)
-                if done % config.log_every == 0 or done == end or stop:
-                    log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))
-                log.bar.update(1)
-                validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
-                if not (validating or stop or done == end or done % config.checkpoint_every == 0):
-                    continue
-                recorded = part.model.with_conventions(tokens=part.model.tokens)  # what the weights were trained with
-                variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
-                if validating:
-                    numbers, images = validate(variables, own_body, examples, part, own_networks)
-                    score = numbers["psnr"]
+        waiting = Waiting()
+        with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
+            watch, stop = Watch(log, state), False
+            for first, last in config.spans(begin, end):
+                part = config.at(first)
+                loader = stage_loader(make_source, config, first, mesh)
+                examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
+                batches = loader.batches(first, last, waiting=waiting)
+                for step, batch in batches:
+                    if step == first and mesh is None:  # costs nothing: once, and the arrays are in memory
+                        for line in bad_samples(loader, step, batch):
+                            log.event(step, "sample", line, samples=[line])
+                    with stage("compiling the step") if step == first else contextlib.nullcontext():
+                        state, metrics = train_step(state, batch, body, part, networks, mesh)
+                    watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
+                    stop = stopping(done)
+                    if done % config.log_every == 0 or done == end or stop:
+                        log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))
+                    log.bar.update(1)
+                    validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
+                    if not (validating or stop or done == end or done % config.checkpoint_every == 0):
+                        continue
+                    recorded = part.model.with_conventions(tokens=part.model.tokens)  # what the weights were trained with
+                    variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
+                    if validating:
+                        numbers, images = validate(variables, own_body, examples, part, own_networks)
+                        score = numbers["psnr"]
+                        if leading:
+                            _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
                     if leading:
-                        _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
-                if leading:
-                    save_weights(out / "weights.safetensors", variables, recorded, "float16")
-                if score is not None and (best is None or score > best):
-                    best = score
-                    if leading:
-                        save_weights(out / "best.safetensors", variables, recorded, "float16")
-                checkpoints.save(state, score)
+                        save_weights(out / "weights.safetensors", variables, recorded, "float16")
+                    if score is not None and (best is None or score > best):
+                        best = score
+                        if leading:
+                            save_weights(out / "best.safetensors", variables, recorded, "float16")
+                    checkpoints.save(state, score)
+                    if stop:
+                        break
+                batches.close()
                 if stop:
                     break
-            batches.close()
-            if stop:
-                break
-        watch.look()
-        checkpoints.close()
-        # a single process may have been told after its last step; several agree only on steps
-        stop = stop or (jax.process_count() == 1 and stopping(end))
-    if stop:
-        raise TrainingInterrupted(state, config.steps)
-    return state
+            watch.look()
+            checkpoints.close()
+            # a single process may have been told after its last step; several agree only on steps
+            stop = stop or (jax.process_count() == 1 and stopping(end))
+        if stop:
+            raise TrainingInterrupted(state, config.steps)
+        return state
 
 
 def _rehearse(
@@ -393,8 +374,8 @@ def _report(log: RunLog, out: Path, done: int, numbers: dict[str, float], image:
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
     """A function of the number of steps done: whether to stop after them, for Ctrl-C or because the machine is taken away.
 
-    All processes must ask it after every step. One process checks its own signals. Several may receive a signal at different
-    steps, so that jax's coordination service agrees on one
+    All processes must ask it after every step. One process checks its own signals, a second of which does what it did before.
+    Several may receive one at different steps, so that jax's coordination service agrees on a step
     (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
     """
     if jax.process_count() > 1:
@@ -402,17 +383,7 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
 
         yield multihost_utils.reached_preemption_sync_point
         return
-    with _own_signals() as stop:
-        yield lambda _: stop.is_set()
-
-
-@contextlib.contextmanager
-def _own_signals() -> Generator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; a second signal does what it did before."""
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals
-        yield stop
-        return
 
     def handle(number, _frame):
         if stop.is_set():
@@ -422,9 +393,10 @@ def _own_signals() -> Generator[threading.Event]:
         stop.set()  # the handler stays: with that of the command line again, saving would have to be done within seconds
         logger.warning("stopping after this step; what is done is saved")
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    caught = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()  # others may not
+    previous = {number: signal.signal(number, handle) for number in caught}
     try:
-        yield stop
+        yield lambda _: stop.is_set()
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -18,15 +18,7 @@ from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import inexact_leaves
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.datasets.subject import FileBody, open_people
-from humangs_jax.data.loading import (
-    CaptureCache,
-    CaptureSource,
-    Example,
-    Loader,
-    Mixture,
-    PeopleCache,
-    Source,
-)
+from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, Mixture, PeopleCache, Source
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
 from humangs_jax.people.subject import SPLITS
@@ -48,24 +40,17 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
     return Loader(make_source(part), part.batch_size, part.seed, sharding, first_step=step, first_example=before)
 
 
-def check_example(example: Example, name: str) -> None:
-    """Raises: ValueError, one line that begins with the name, unless all numbers are finite, colors and masks in [0, 1]."""
-    kinds = {"images": UNIT, "masks": UNIT}
-    arrays = {path: (np.asarray(leaf), kinds.get(path.split(".")[-1], FINITE)) for path, leaf in inexact_leaves(example)}
-    check_values(name, arrays)
-
-
 def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
-    """What is wrong with the samples that this process gave to a step, a line for each that `check_example` refuses.
+    """A line for each sample of this process in a step with numbers that are not finite, or colors and masks beyond [0, 1].
 
-    Arguments: batch: the batch of that step, on one device. None: the samples are made again: a loader is a pure function, so
-    a run need not keep what it trains on.
+    batch: of that step, on one device. None: made again; a loader is a pure function, so a run need not keep what it trains on.
     """
-    found = []
+    found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
         example = loader.example_at(step, row) if batch is None else jax.tree.map(lambda x, i=i: x[i], batch)
+        leaves = {path: np.asarray(leaf) for path, leaf in inexact_leaves(example)}
         try:
-            check_example(example, f"sample {row}")
+            check_values(f"sample {row}", {path: (x, kinds.get(path.split(".")[-1], FINITE)) for path, x in leaves.items()})
         except ValueError as error:
             found.append(f"{error} ({loader.describe_at(step, row)})")
     return found
@@ -137,9 +122,7 @@ def training_people(
     The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none, or if synthetic people
     are asked for beside a body that is not theirs.
     """
-    parts = []
-    if data is not None:
-        parts.append(people_on_disk(data, FileBody(body, str(body_file))))
+    parts = [] if data is None else [people_on_disk(data, FileBody(body, str(body_file)))]
     if on_the_fly and str(body_file) != DEFAULT_BODY:
         raise ValueError(f"synthetic people have the body that comes with the package, not {body_file}")
     if on_the_fly:

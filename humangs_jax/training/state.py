@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
+from humangs_jax.core.array_types import Array, Float, Int, PyTree, Scalar
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
@@ -46,16 +46,11 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
     if variables is None:
         variables = init_humangs(jax.random.key(config.seed), config.model)
     # copies: the training step gives its state's buffers away, so neither the caller nor two fields may share one
-    params, batch_stats = (
-        jax.tree.map(lambda x: jnp.array(x, jnp.float32), variables[name]) for name in ("params", "batch_stats")
-    )
-    return TrainState(
-        step=jnp.zeros((), jnp.int32),
-        params=params,
-        batch_stats=batch_stats,
-        opt_state=make_optimizer(config.optimizer, config.steps).init(params),
-        ema_params=None if config.ema_decay is None else jax.tree.map(jnp.copy, params),
-    )
+    own = jax.tree.map(lambda x: jnp.array(x, jnp.float32), dict(variables))
+    params, batch_stats = own["params"], own["batch_stats"]
+    opt_state = make_optimizer(config.optimizer, config.steps).init(params)
+    average = None if config.ema_decay is None else jax.tree.map(jnp.copy, params)
+    return TrainState(jnp.zeros((), jnp.int32), params, batch_stats, opt_state, average)
 
 
 class GuardState(NamedTuple):
@@ -87,11 +82,6 @@ def finite_gradients(gradients: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
 
 
-def all_finite(tree: PyTree) -> Bool[Array, ""]:
-    """Whether every entry of every leaf is finite."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
-
-
 def gradient_norm(gradients: PyTree) -> Scalar:
     """Euclidean norm over all entries of all leaves."""
     return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
@@ -109,7 +99,7 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
         return GuardState(*counts, jnp.zeros(()), inner.init(params))
 
     def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
-        finite = jnp.isfinite(value) & all_finite(gradients)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in (value, *jax.tree.leaves(gradients))]))
         gradients = finite_gradients(gradients)
         norm = gradient_norm(gradients)
         good = jnp.isfinite(value) & (norm <= skip_norm)

@@ -16,7 +16,6 @@ from humangs_jax.evaluation.scores import (
     MaskBox,
     SquareBox,
     WholeFrame,
-    find_protocol,
 )
 from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM
 
@@ -51,9 +50,6 @@ def test_the_presets_are_those_of_the_table():
     assert {name: tuple(getattr(p, field) for field in fields) for name, p in PROTOCOLS.items()} == table
     assert [name for name, p in PROTOCOLS.items() if p.needs_masks] == ["animatable-gaussians", "ghg", "giga", "lhm++"]
     own = dataclasses.replace(PROTOCOLS["lhm"], lpips=())
-    assert find_protocol(own) is own and find_protocol("lhm") is PROTOCOLS["lhm"]
-    with pytest.raises(ValueError, match=r"'lmh': expected one of humangs, animatable-gaussians"):
-        find_protocol("lmh")
     assert typing.get_args(typing.get_type_hints(Evaluate)["protocol"]) == tuple(PROTOCOLS)
     with pytest.raises(dataclasses.FrozenInstanceError):
         own.masked = True  # ty: ignore[invalid-assignment]
