@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -21,6 +21,14 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 
     for line in remarks(photos, person):
         warn(line)
+
+
+def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
+    """The keypoints of the views of a `Photos` or `Capture`, None if there is no file. Raises: see `read_keypoints`."""
+    from humangs_jax.data.keypoints.reading import read_keypoints
+
+    height, width = views.images.shape[1:3]
+    return None if file is None else read_keypoints(file, views.names, width, height, person=person)
 
 
 def keypoints_wanted() -> tuple[str, ...]:

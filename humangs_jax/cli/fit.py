@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.captures import found_here, tell_found
+from humangs_jax.cli.captures import found_here, keypoints_of, tell_found
 from humangs_jax.cli.options import Place, UsageError, require_file, require_folder, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import at_least
@@ -26,13 +26,16 @@ class Detections:
     """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
     def read(self, views: Any) -> Any:
-        """The keypoints of the views of a `Photos` or `Capture`, None if no file was given. Raises: see `read_keypoints`."""
-        from humangs_jax.data.keypoints.reading import read_keypoints
+        """The keypoints of the views, see `keypoints_of`."""
+        return keypoints_of(views, self.keypoints, self.person)
 
-        if self.keypoints is None:
-            return None
-        height, width = views.images.shape[1:3]
-        return read_keypoints(self.keypoints, views.names, width, height, person=self.person)
+    def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
+        """The keypoints of the views, and without a file of them the record of the fit in the capture's folder."""
+        from humangs_jax.data.photos import capture_folder
+        from humangs_jax.fitting.files import FIT_FILE, read_fit_record
+
+        file = capture_folder(capture) / FIT_FILE
+        return self.read(views), read_fit_record(file) if self.keypoints is None and file.exists() else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,12 +109,7 @@ class Fit:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise UsageError(f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}")
         self._check_places(way)
-        if way == "--scan":
-            self._fit_scan()
-        elif way == "--refine":
-            self._refine()
-        else:
-            self._fit_keypoints()
+        {"--scan": self._fit_scan, "--refine": self._refine, "--keypoints": self._fit_keypoints}[way]()
 
     def _given(self) -> Iterator[str]:
         """Options of the ways of fitting whose value is not the default, in the order of the help."""
@@ -177,19 +175,15 @@ class Fit:
         assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.data.photos import capture_folder
-            from humangs_jax.fitting.files import FIT_FILE, check_place, read_fit_record, write_fitted
+            from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.refine import refine_capture, usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
-            keypoints, record = self.detections.read(start), None
-            record_file = capture_folder(self.capture) / FIT_FILE
-            if keypoints is None and record_file.exists():
-                record = read_fit_record(record_file)
-                keypoints = record.of_views(start.names)
+            keypoints, record = self.detections.read_or_recorded(self.capture, start)
+            keypoints = keypoints if record is None else record.of_views(start.names)
         fixed, bare = self.refinement.fixed_cameras, self.scan.bare
         config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
@@ -269,16 +263,11 @@ class Check:
         with stage("starting"):
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.data.photos import capture_folder
             from humangs_jax.detection.people import available
-            from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         with stage("reading the capture"):
             capture = load_capture(self.capture, fit_masks=True)
-            keypoints, record = self.detections.read(capture), None
-            record_file = capture_folder(self.capture) / FIT_FILE
-            if keypoints is None and record_file.exists():
-                record = read_fit_record(record_file)
+            keypoints, record = self.detections.read_or_recorded(self.capture, capture)
         if available() and (capture.masks is None or (keypoints is None and record is None)):
             capture, keypoints = self._found(capture, keypoints, record)
         with stage("drawing the body"):

@@ -11,7 +11,7 @@ import os
 import re
 import tempfile
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -96,15 +96,12 @@ def described(command: type[Any]) -> type[Any]:
 
     tyro alone shows `PATH` for every positional argument, `{None}|PATH`, and `(default: None)`.
     """
-    hints = get_type_hints(command, include_extras=True)
-    for field in dataclasses.fields(command):
-        hint = hints[field.name]
-        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    for field, hint, kind, positional in _options(command):
         if dataclasses.is_dataclass(kind):
             described(kind)
             continue
         shown = _value_shown(kind)
-        if Positional in getattr(hint, "__metadata__", ()) and get_origin(kind) is not Literal:
+        if positional and get_origin(kind) is not Literal:
             name = field.name.upper()
             shown = name if field.default is dataclasses.MISSING else f"[{name}]"
         quiet = field.default in (None, ()) or kind is bool
@@ -115,14 +112,22 @@ def described(command: type[Any]) -> type[Any]:
 
 def option_names(command: type[Any]) -> set[str]:
     """The options of a command as they are typed; a flag that is on has its negative only."""
-    names, hints = set(), get_type_hints(command, include_extras=True)
-    for field in dataclasses.fields(command):
-        kind = get_args(hints[field.name])[0] if get_origin(hints[field.name]) is Annotated else hints[field.name]
+    names = set()
+    for field, _, kind, positional in _options(command):
         if dataclasses.is_dataclass(kind):
             names |= option_names(kind)
-        elif Positional not in getattr(hints[field.name], "__metadata__", ()):
-            names.add("--no-" * (field.default is True) + "--" * (field.default is not True) + field.name.replace("_", "-"))
+        elif not positional:
+            names.add(option_of(f"no_{field.name}" if field.default is True else field.name))
     return names
+
+
+def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, bool]]:
+    """Of each field: itself, its annotation, what that annotates, and whether it is a positional argument."""
+    hints = get_type_hints(command, include_extras=True)
+    for field in dataclasses.fields(command):
+        hint = hints[field.name]
+        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        yield field, hint, kind, Positional in getattr(hint, "__metadata__", ())
 
 
 def _value_shown(kind: Any) -> str | None:
@@ -242,9 +247,7 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
     """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ITERATIONS_ALONE`."""
-    if text is None:
-        return ITERATIONS_ALONE
-    return None if text == "0" else refine_limits(text, "--refine")
+    return ITERATIONS_ALONE if text is None else None if text == "0" else refine_limits(text, "--refine")
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 
-from humangs_jax.cli.captures import tell_found
+from humangs_jax.cli.captures import keypoints_of, tell_found
 from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import at_least
@@ -153,13 +153,10 @@ class Start:
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
         with stage("finding the person"):
             from humangs_jax.apps import detect
-            from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
 
-            photos, given = load_photos(self.out), None
-            if material.keypoints is not None:
-                height, width = photos.images.shape[1:3]
-                given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            photos = load_photos(self.out)
+            given = keypoints_of(photos, material.keypoints, self.person)
             people, person = detect.person_in_capture(self.out, photos, given, self.person)
         with stage("writing what was found"):
             detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
@@ -222,7 +219,6 @@ class Start:
             from humangs_jax.apps.detect import MASKS
             from humangs_jax.apps.start import better_body
             from humangs_jax.body.library import load_body
-            from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
@@ -233,10 +229,8 @@ class Start:
             assert material.keypoints is not None
             # the detector's own masks are at the photos' edges already
             photos = load_photos(self.out, fit_masks=self.fit_masks and material.masks != self.out / MASKS)
-            height, width = photos.images.shape[1:3]
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
-            person = None if found_here else self.person
-            keypoints = read_keypoints(material.keypoints, photos.names, width, height, person=person)
+            keypoints = keypoints_of(photos, material.keypoints, None if found_here else self.person)
             fitted = fit_photos(photos, keypoints, load_body(), fixed_cameras=one_moment is not None)
         with stage("examining the fit"):
             report = fitted.report

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -34,8 +33,6 @@ class ScanViews:
     """All cameras at 2.0 bounding radii: the published "near" test set. Short for --factors 2 2."""
     factors: tuple[float, float] = (1.0, 1.75)
     """Camera distance in bounding radii, uniform between the two."""
-    supersample: Annotated[int, at_least(1)] = 3
-    """Samples along each pixel's side."""
     train: Annotated[int, at_least(0)] = 2300
     """Scans of the training list, the first of the published shuffle."""
     test: Annotated[int, at_least(0)] = 145
@@ -91,7 +88,6 @@ class Preprocess:
             self.size,
             views=scans.views,
             factors=factors,
-            supersample=scans.supersample,
             every=self.every,
             train=scans.train,
             test=scans.test,
@@ -277,6 +273,8 @@ class Convert:
 
 KEPT_SECONDS = 30 * 24 * 3600.0
 """For which the scores of an interrupted evaluation are kept."""
+PAGE_IMAGES = 120
+"""That the page of an evaluation shows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -330,8 +328,6 @@ class Evaluate:
     """Write a table of people."""
     latex: Annotated[Path | None, Place((".tex",))] = None
     """Write the same table for LaTeX (package booktabs)."""
-    page_images: Annotated[int, at_least(0)] = 120
-    """Images that the page shows."""
 
     def run(self) -> None:
         files = {name: getattr(self, name) for name in ("json", "html", "csv", "markdown", "latex")}
@@ -359,7 +355,7 @@ class Evaluate:
                 indices=self.indices,
                 lpips=networks,
                 body=self.body,
-                page_images=self.page_images if self.html is not None else 0,
+                page_images=PAGE_IMAGES if self.html is not None else 0,
                 keep=keep,
                 progress=True,
             )
@@ -370,8 +366,6 @@ class Evaluate:
         for name, path in files.items():
             if path is not None:
                 wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))
-        if self.html is None:
-            suggest("humangs evaluate", self.source, *self._given(), "--html scores.html")
 
     def _kept(self) -> Path | None:
         """A folder in the user's cache, that of the same command on the same files; None where nothing can be written."""
@@ -380,7 +374,7 @@ class Evaluate:
 
         named = [self.source, self.avatar, self.weights, self.predictions, self.indices, self.body]
         named += [file for files in vars(self.lpips).values() for file in files]
-        said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None and self.page_images]
+        said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None]
         for path in named:
             files = [] if path is None else [path, *sorted(path.rglob("*"))]
             said += [(str(file.resolve()), (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files if file.exists()]
@@ -394,11 +388,3 @@ class Evaluate:
         except (OSError, RuntimeError):  # RuntimeError: no home
             return None
         return folder
-
-    def _given(self) -> Iterator[str | Path]:
-        names = ("avatar", "weights", "predictions", "protocol", "body", "inputs", "indices")
-        options = {f"--{name}": getattr(self, name) for name in names if getattr(self, name) is not None}
-        options |= {f"--{name.replace('_', '-')}": files for name, files in vars(self.lpips).items()}
-        for option, values in options.items():
-            for value in values if isinstance(values, tuple) else (values,):
-                yield from (option, value if isinstance(value, Path) else str(value))

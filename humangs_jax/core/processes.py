@@ -190,7 +190,7 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
-    if given := _folder_of_jax():
+    if given := sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX):
         return Path(given)
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
@@ -204,10 +204,6 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     if "jax" in sys.modules:
         sys.modules["jax"].config.update("jax_compilation_cache_dir", str(cache))
     return cache
-
-
-def _folder_of_jax() -> str | None:
-    return sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX)
 
 
 def user_cache() -> Path:

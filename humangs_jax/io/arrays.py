@@ -3,14 +3,13 @@
 Raises: Refused, see `io.reading`; `ArrayFile` knows its file, and every fault is one line with file and key.
 """
 
-import contextlib
 import hashlib
 import io
 import math
 import os
 import threading
 import zipfile
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -241,8 +240,7 @@ def read_npz(path: str | Path, wanted: Callable[[str], bool] | None = None) -> t
     return arrays, tuple(pickled)
 
 
-@contextlib.contextmanager
-def open_archive(file: BinaryIO | io.BytesIO, size: int) -> Generator[zipfile.ZipFile]:
+def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     """A zip archive whose members together stay within the limits.
 
     Raises: Refused; what zipfile raises for damaged archives.
@@ -251,14 +249,14 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> Generator[zipfile.Zi
     if not ending:
         raise zipfile.BadZipFile("not a zip archive, or cut off")
     check_limit("members", ending[5] // 46, "members")  # each takes 46 bytes and its name
-    with zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        if len({member.filename for member in members}) < len(members):
-            raise Refused("two members of one name")
-        if strange := [m.filename for m in members if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)]:
-            raise Refused(f"{strange[0]}: compressed by a method that is not read")
-        check_unpacked(size, sum(member.file_size for member in members))
-        yield archive
+    archive = zipfile.ZipFile(file)
+    members = archive.infolist()
+    if len({member.filename for member in members}) < len(members):
+        raise Refused("two members of one name")
+    if strange := [m.filename for m in members if m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)]:
+        raise Refused(f"{strange[0]}: compressed by a method that is not read")
+    check_unpacked(size, sum(member.file_size for member in members))
+    return archive
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:

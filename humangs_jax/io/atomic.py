@@ -5,7 +5,6 @@ later process writes to the same place; an old folder that it had already moved 
 """
 
 import contextlib
-import errno
 import functools
 import os
 import platform
@@ -95,7 +94,14 @@ def replace_folder(folder: str | os.PathLike[str], write: Callable[[Path], objec
     with _naming(folder, temporary), _unfinished(temporary):
         write(temporary)
         with undisturbed():
-            _exchange(folder, temporary, aside)
+            with contextlib.suppress(FileNotFoundError):
+                folder.rename(aside)
+            try:
+                temporary.rename(folder)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    aside.rename(folder)
+                raise
             shutil.rmtree(aside, ignore_errors=True)
 
 
@@ -126,23 +132,6 @@ def remove_unfinished() -> None:
     """Removes the temporary files that this process is still writing, just before it is ended. Final files are not touched."""
     for temporary in tuple(_being_written):
         _remove(temporary)
-
-
-def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
-    """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
-    while True:
-        with contextlib.suppress(FileNotFoundError):
-            folder.rename(aside)
-        try:
-            temporary.rename(folder)
-            return
-        except BaseException as error:
-            if isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-                shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
-                continue
-            with contextlib.suppress(OSError):
-                aside.rename(folder)
-            raise
 
 
 def check_replaceable(
@@ -185,10 +174,9 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
+    """What is in a folder: "body.npz, capture.json, images"; empty if there is nothing."""
     entries = _entries(folder)
-    told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
-    return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+    return ", ".join(entries[:TOLD]) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
@@ -197,13 +185,6 @@ def _entries(folder: str | os.PathLike[str]) -> list[str]:
         return sorted(os.listdir(folder))
     except (FileNotFoundError, NotADirectoryError):
         return []
-
-
-def _told(entry: Path) -> str:
-    if entry.is_symlink() or not entry.is_dir():
-        return entry.name
-    count = sum(len(files) for _, _, files in os.walk(entry))
-    return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
 def add_files(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
-from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
 
 FORMATS = ("PNG", "JPEG")
@@ -156,7 +156,7 @@ def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.nda
     A fourth channel is alpha. compress_level: of zlib; 1 takes a third of the time and a sixth more room. The file appears whole
     or not at all. Raises: OSError if it cannot be written.
     """
-    replace_file(path, lambda temporary: temporary.write_bytes(png_bytes(image, compress_level)))
+    write_bytes(path, png_bytes(image, compress_level))
 
 
 def png_bytes(image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"], compress_level: int = 6) -> bytes:

@@ -12,7 +12,6 @@ import logging
 import os
 import re
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,8 @@ import numpy as np
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import FileError, Refused, check_limit, check_unpacked, inside, parse_json, read_bytes, reading, shown
+
+logger = logging.getLogger(__name__)
 
 GLB_START, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -152,8 +153,6 @@ class GlbWriter:
         write_bytes(path, struct.pack("<III", GLB_START, 2, 12 + len(chunks)) + chunks)
 
 
-logger = logging.getLogger(__name__)
-
 TYPES = ("obj", "ply", "glb", "stl", "off")
 """Suffixes of the formats; trimesh has more, of which some start programs or read XML."""
 
@@ -182,15 +181,16 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
         elif kind == "obj":  # text of other encodings would be guessed at for a long time
             stream = io.StringIO(_grouped(data.decode("utf-8", "replace"), painted))
         materials: dict[str, Any] = {} if kind in ("stl", "off") else {"skip_materials": not painted}
-        resolver = _folder_of(path) if painted else None
+        resolver = _Folder(path.parent) if painted else None
         # processing would silently drop what is not finite
         scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, **materials)
         if resolver is not None:
             resolver.report(path)
         drawn = [scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry]
         check_limit("corners", sum(3 * len(getattr(part, "faces", ())) for part in drawn), "corners of triangles")
-        images = [image for part in drawn if (image := _texture(part)) is not None]
-        check_limit("capture_pixels", sum(image.width * image.height for image in images), "pixels of textures")
+        materials_of = [getattr(part.visual, "material", None) for part in drawn]
+        images = [getattr(each, "baseColorTexture", None) or getattr(each, "image", None) for each in materials_of]
+        check_limit("capture_pixels", sum(image.width * image.height for image in images if image), "pixels of textures")
         if colors:
             for part in {id(part): part for part in drawn if isinstance(part, trimesh.Trimesh)}.values():
                 _paint(part)
@@ -229,55 +229,44 @@ def _grouped(text: str, materials: bool) -> str:
     return "\n".join([plain(others), *faces])
 
 
-def _folder_of(path: Path) -> Any:
-    """What trimesh asks for the files that a mesh names: materials and textures beside it."""
-    from trimesh.resolvers import Resolver
+class _Folder:
+    """What trimesh asks for the files that a mesh names: materials and textures beside it. It goes on without those refused."""
 
-    class Folder(Resolver):
-        def __init__(self, folder: Path) -> None:
-            self.folder, self.read, self.faults = folder, {}, {}
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.read, self.faults = folder, {}, {}
 
-        def get(self, key: str) -> bytes:
-            if key not in self.read and key not in self.faults:
-                try:
-                    check_limit("parts", len(self.read) + len(self.faults), "materials and textures")
-                    self.read[key] = self._content(key.strip())
-                except (ValueError, OSError) as error:
-                    self.faults[key] = str(error)
-            if key in self.faults:
-                raise FileNotFoundError(self.faults[key])  # trimesh goes on without it
-            return self.read[key]
+    def get(self, key: str) -> bytes:
+        if key not in self.read and key not in self.faults:
+            try:
+                check_limit("parts", len(self.read) + len(self.faults), "materials and textures")
+                self.read[key] = self._content(key.strip())
+            except (ValueError, OSError) as error:
+                self.faults[key] = str(error)
+        if key in self.faults:
+            raise FileNotFoundError(self.faults[key])
+        return self.read[key]
 
-        def _content(self, key: str) -> bytes:
-            if not key:
-                raise Refused("has no name")
-            file = inside(self.folder, key)
-            with reading(file, "texture"):
-                if file.suffix.lower() == ".mtl":
-                    return read_bytes(file, "slow_text_bytes")
-                data = read_bytes(file, "image_bytes")
-                check_limit("mesh_bytes", sum(map(len, self.read.values())) + len(data), "bytes of textures")
-                with image_in(data) as image:
-                    image.load()
-                return data
+    __getitem__ = get
 
-        def report(self, path: Path) -> None:
-            """Warn of the first file that could not be read, and say how many there are."""
-            if self.faults:
-                key, why = next(iter(self.faults.items()))
-                more = f" (and {len(self.faults) - 1} others)" if len(self.faults) > 1 else ""
-                logger.warning("%s: %s", path, FileError("", f"left out {shown(key)}{more}", why))
+    def _content(self, key: str) -> bytes:
+        if not key:
+            raise Refused("has no name")
+        file = inside(self.folder, key)
+        with reading(file, "texture"):
+            if file.suffix.lower() == ".mtl":
+                return read_bytes(file, "slow_text_bytes")
+            data = read_bytes(file, "image_bytes")
+            check_limit("mesh_bytes", sum(map(len, self.read.values())) + len(data), "bytes of textures")
+            with image_in(data) as image:
+                image.load()
+            return data
 
-        def keys(self) -> Iterator[str]:
-            return iter(())
-
-        def namespaced(self, namespace: str) -> Any:
-            raise Refused("folders in folders are not looked up")
-
-        def write(self, name: str, data: Any) -> None:
-            raise Refused("nothing is written")
-
-    return Folder(path.parent)
+    def report(self, path: Path) -> None:
+        """Warn of the first file that could not be read, and say how many there are."""
+        if self.faults:
+            key, why = next(iter(self.faults.items()))
+            more = f" (and {len(self.faults) - 1} others)" if len(self.faults) > 1 else ""
+            logger.warning("%s: %s", path, FileError("", f"left out {shown(key)}{more}", why))
 
 
 GREY = 153
@@ -295,19 +284,13 @@ def _paint(mesh: Any) -> None:
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1])))
 
 
-def _texture(mesh: Any) -> Any:
-    """As a PIL.Image that may not be decoded yet, None if it has none."""
-    material = getattr(mesh.visual, "material", None)
-    image = getattr(material, "baseColorTexture", None)
-    return getattr(material, "image", None) if image is None else image
-
-
 def _check_glb(data: bytes, textures: bool) -> None:
     """Raises: Refused, KeyError, TypeError, ... for sizes and places that do not fit the file."""
     content, binary = parse_glb(data)
     views = [view_of(view, binary) for view in content.get("bufferViews", [])]
     counts = [count_of(accessor) for accessor in content.get("accessors", [])]
-    of_mesh = [sum(_corners(part, counts) for part in mesh["primitives"]) for mesh in content.get("meshes", [])]
+    corners = lambda part: counts[part["attributes"]["POSITION"]] + (3 * counts[part["indices"]] if "indices" in part else 0)
+    of_mesh = [sum(map(corners, mesh["primitives"])) for mesh in content.get("meshes", [])]
     drawn = [node["mesh"] for node in content.get("nodes", []) if "mesh" in node]
     check_limit("corners", max(sum(of_mesh), sum(of_mesh[mesh] for mesh in drawn)), "corners of triangles")
     parts = [len(mesh["primitives"]) for mesh in content.get("meshes", [])]
@@ -319,9 +302,3 @@ def _check_glb(data: bytes, textures: bool) -> None:
                     pass
             elif str(image.get("uri", "")).startswith("data:"):
                 raise Refused("a texture within the text: expected it as a part of the numbers")
-
-
-def _corners(part: dict[str, Any], counts: list[int]) -> int:
-    """Corners of a part of a mesh."""
-    indices = 3 * counts[part["indices"]] if "indices" in part else 0
-    return indices + counts[part["attributes"]["POSITION"]]

@@ -334,26 +334,19 @@ def parse_json(text: str) -> Any:
 
 def check_nesting(value: Any) -> None:
     """Raises: Refused if lists and dicts contain each other more than `nesting` times."""
-    level = [value]
-    for _ in range(limits().nesting):
-        level = [item for each in level if isinstance(each, list | dict) for item in _containers(each)]
+    level = [[value]]
+    for _ in range(limits().nesting + 1):
+        contents = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [item for items in contents for item in items if isinstance(item, list | dict)]
         if not level:
             return
     raise Refused(f"not usable: nested too deeply, the limit nesting is {limits().nesting} (docs/security.md)")
 
 
-def _containers(value: Any) -> list[Any]:
-    values = value.values() if isinstance(value, dict) else value
-    return [item for item in values if isinstance(item, list | dict)]
-
-
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
     """A configuration of class `cls` from its JSON, see `core.configuration`. Raises: FileNotFoundError; FileError."""
     with reading(path, "configuration"):
-        try:
-            return config_from_json(cls, read_text(path))
-        except ValueError as error:
-            raise Refused(str(error)) from error
+        return config_from_json(cls, read_text(path))
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import dataset_files
 import honest_files as honest
 import numpy as np
-from hostile_cases import case
+from hostile_cases import capture_with, case
 from readers import AMASS
 
 from humangs_jax.body.library import save_body
@@ -79,6 +79,18 @@ AVATARS = {
     "a false checksum": header(checksum="0" * 64),
     "a checksum that is a number": header(checksum=7),
     "no points": to(means=np.float32(3)),
+    "means of 3e38": put("means", 3e38),
+    "colors of 3e38": put("colors", 3e38),
+    "scales of 1e30": put("scales", 1e30),
+    "quaternions of 1e30": put("quats", 1e30),
+    "joints a light year away": put("rest_joints", 1e16),
+    "weights of 0": full("skinning_weights", 0),
+    "weights of 1 each": full("skinning_weights", 1),
+    "no vertices": to(rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)),
+    "no joints": to(rest_joints=np.zeros((0, 3), np.float32)),
+    "a title for a joint": header(joint_names=["a", "b", "\x1b]0;OWNED\x07"]),
+    "a new line for a joint": header(joint_names=["a", "b", "a\nb"]),
+    "half a surrogate for a joint": header(joint_names=["a", "b", "\ud800"]),
 }
 for kind, change in AVATARS.items():
     item = 3 if "checksum" in kind else 7
@@ -104,6 +116,9 @@ BODIES = {
     "10^6 parents": to(parents=np.zeros(10**6, np.int16)),
     "directions of another size": to(shape_directions=np.zeros((3, 9, 3), np.int16)),
     "a number for the template": to(template=np.float32(1)),
+    "a template of 1e38": put("template", 1e38),
+    "directions of 1e38": to(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
+    "a regressor of 1e38": put("regressor_values", 1e38),
 }
 for kind, change in BODIES.items():
     arrays_case(kind, "body", body_file, change, 7)
@@ -114,6 +129,11 @@ SMPLX = {
     "another tree": put("kintree_table", 9, (0, 3)),
     "words": cast("weights", str),
     "no vertices": to(v_template=np.zeros((0, 3))),
+    "a template of 1e38": put("v_template", 1e38),
+    "directions of 1e300": full("shapedirs", 1e300, float),
+    "weights of 0": full("weights", 0),
+    "weights of 1e38": put("weights", 1e38),
+    "a regressor of 1e38": put("J_regressor", 1e38),
 }
 for kind, change in SMPLX.items():
     arrays_case(kind, "smplx npz", dataset_files.model_arrays, change, 7)
@@ -154,34 +174,6 @@ for kind, change in BANKS.items():
     arrays_case(kind, "bank", honest.bank_arrays, change, 7)
 
 
-# Numbers that no body has, and what float32 does not hold -------------------------------------------------------------
-
-for kind, change in {
-    "means of 3e38": put("means", 3e38),
-    "colors of 3e38": put("colors", 3e38),
-    "scales of 1e30": put("scales", 1e30),
-    "quaternions of 1e30": put("quats", 1e30),
-    "joints a light year away": put("rest_joints", 1e16),
-    "weights of 0": full("skinning_weights", 0),
-    "weights of 1 each": full("skinning_weights", 1),
-    "no vertices": to(rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)),
-    "no joints": to(rest_joints=np.zeros((0, 3), np.float32)),
-}.items():
-    arrays_case(kind, "avatar", honest.avatar_file, change)
-for kind, change in {
-    "a template of 1e38": put("template", 1e38),
-    "directions of 1e38": to(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
-    "a regressor of 1e38": put("regressor_values", 1e38),
-}.items():
-    arrays_case(kind, "body", body_file, change)
-for kind, change in {
-    "a template of 1e38": put("v_template", 1e38),
-    "directions of 1e300": full("shapedirs", 1e300, float),
-    "weights of 0": full("weights", 0),
-    "weights of 1e38": put("weights", 1e38),
-    "a regressor of 1e38": put("J_regressor", 1e38),
-}.items():
-    arrays_case(kind, "smplx npz", dataset_files.model_arrays, change)
 for value in (1e38, 1e300, 1e9):
     for key in ("rotations", "translations"):
         arrays_case(f"{key} of {value:g}", "motion npz", honest.motion_arrays, put(key, value))
@@ -189,25 +181,15 @@ for value in (1e38, 1e300, 1e9):
         arrays_case(f"{key} of {value:g}", "amass", AMASS.copy, put(key, value))
 
 
-def capture_of(key, value):
-    def make(folder):
-        honest.write_capture(folder)
-        arrays = honest.body_parameters()
-        arrays[key] = np.full(arrays[key].shape, value)
-        np.savez(folder / "body.npz", **arrays)
-        return folder
-
-    return make
+def body_of(key, value):
+    arrays = honest.body_parameters()
+    arrays[key] = np.full(arrays[key].shape, value)
+    return capture_with(prepare=lambda folder: np.savez(folder / "body.npz", **arrays))
 
 
 for value in (1e38, 1e300, -1e20, 1e6):
     for key in ("betas", "rotations", "translations", "displacement"):
-        case(f"{key} of {value:g}", "capture", capture_of(key, value))
-
-
-for kind, name in {"a title": "\x1b]0;OWNED\x07", "a new line": "a\nb", "half a surrogate": "\ud800"}.items():
-    arrays_case(f"{kind} for a joint", "avatar", honest.avatar_file, header(joint_names=["a", "b", name]))
-
+        case(f"{key} of {value:g}", "capture", body_of(key, value))
 
 RATES = {"10^9": 1e9, "10^-9": 1e-9, "10^300": 1e300, "10^-300": 1e-300, "1,001": 1001.0}
 for kind, rate in RATES.items():

@@ -1,4 +1,4 @@
-"""Captures and calibrations that name files outside of their folder."""
+"""Captures and calibrations that name files outside of their folder, and folders that cost more than they weigh."""
 
 import json
 import os
@@ -6,99 +6,74 @@ import os
 import honest_files as honest
 import numpy as np
 from honest_files import pixels
-from hostile_cases import case
+from hostile_cases import capture_with, case
 from PIL import Image
 
 # Paths out of the folder -------------------------------------------------------------------------------------------------
 
-
-def capture_that_names(key, value, prepare=lambda folder: None):
-    def make(folder):
-        inner = folder / "me"
-        inner.mkdir()
-        honest.write_capture(inner)
-        prepare(folder)
-        description = honest.capture_description()
-        if key == "body":
-            description["body"] = value(folder) if callable(value) else value
-        else:
-            description["views"][0][key] = value(folder) if callable(value) else value
-        (inner / "capture.json").write_text(json.dumps(description))
-        return inner
-
-    return make
+CAPTURES = ("capture", "photos", "boundary")
+"""Readers of captures."""
+OUTSIDE = {"views.0.image": "outside.png", "views.0.mask": "mask.png", "body": "outside.npz"}
 
 
-def photo_outside(folder):
-    Image.fromarray(pixels(12, 10, 3)).save(folder / "outside.png")
-    Image.fromarray(pixels(12, 10)).save(folder / "mask.png")
-    np.savez(folder / "outside.npz", **honest.body_parameters())
+def write_outside(folder):
+    """What lies beside a capture."""
+    Image.fromarray(pixels(12, 10, 3)).save(folder.parent / "outside.png")
+    Image.fromarray(pixels(12, 10)).save(folder.parent / "mask.png")
+    np.savez(folder.parent / "outside.npz", **honest.body_parameters())
 
 
-def linked(name, target):
-    def prepare(folder):
-        photo_outside(folder)
-        (folder / "me" / name).symlink_to(folder / target)
-
-    return prepare
+def linked(folder):
+    write_outside(folder)
+    for name in OUTSIDE.values():
+        (folder / name).symlink_to(folder.parent / name)
 
 
 WAYS_OUT = {
-    "an absolute path": (lambda name: lambda folder: str(folder / name), photo_outside),
-    "a path upwards": (lambda name: f"../{name}", photo_outside),
-    "a path down and upwards": (lambda name: f"images/../../{name}", photo_outside),
-    "a null character": (lambda name: f"{name}\0", photo_outside),
-    "5,000 characters": (lambda name: "x" * 5000 + name, photo_outside),
+    "an absolute path": lambda folder, name: str(folder.parent / name),
+    "a path upwards": lambda folder, name: f"../{name}",
+    "a path down and upwards": lambda folder, name: f"images/../../{name}",
+    "a null character": lambda folder, name: f"{name}\0",
+    "5,000 characters": lambda folder, name: "x" * 5000 + name,
+    "a link outwards": lambda folder, name: name,
 }
-for way, (named, prepare) in WAYS_OUT.items():
-    for key, name in (("image", "outside.png"), ("mask", "mask.png"), ("body", "outside.npz")):
-        for reader in ("capture", "photos", "boundary"):
+for way, named in WAYS_OUT.items():
+    prepare = linked if "link" in way else write_outside
+    for key, name in OUTSIDE.items():
+        for reader in CAPTURES:
             unread = key == "body" and reader == "photos" and "characters" in way
-            expect = "either" if unread else "refused"
-            case(f"{key}: {way}", reader, capture_that_names(key, named(name), prepare), expect, 2)
-LINKS = (("image", "l.png", "outside.png"), ("mask", "l.png", "mask.png"), ("body", "l.npz", "outside.npz"))
-for key, name, target in LINKS:
-    for reader in ("capture", "photos", "boundary"):
-        case(f"{key}: a link outwards", reader, capture_that_names(key, name, linked(name, target)), item=2)
+            make = capture_with(lambda folder, key=key, named=named, name=name: {key: named(folder, name)}, prepare)
+            case(f"{key}: {way}", reader, make, "either" if unread else "refused", 2)
 for name in ("images/000.png", "capture.json", "", ".", "images"):
-    case(f"body: {name!r}", "capture", capture_that_names("body", name), item=2)
+    case(f"body: {name!r}", "capture", capture_with({"body": name}), item=2)
 
 
-def import_that_names(name, prepare=lambda folder: None):
+def import_of(calibration, content, link=False):
+    """Photos and a calibration."""
+
     def make(folder):
-        inner = folder / "in"
-        inner.mkdir()
-        honest.write_import(inner)
-        photo_outside(folder)
-        prepare(inner)
-        frames = [{"file_path": name, "transform_matrix": honest.POSE}]
-        (inner / "transforms.json").write_text(json.dumps(honest.transforms(frames=frames)))
-        return inner / "transforms.json"
+        folder = folder / "in"
+        folder.mkdir()
+        honest.write_import(folder)
+        write_outside(folder)
+        if link:
+            (folder / "photos" / "l.png").symlink_to(folder.parent / "outside.png")
+        (folder / calibration).write_text(json.dumps(content))
+        return folder / calibration
 
     return make
+
+
+def one_frame(name):
+    return honest.transforms(frames=[{"file_path": name, "transform_matrix": honest.POSE}])
 
 
 for name in ("../outside.png", "../../outside.png", "/outside.png", "photos/../../outside.png", "..\\outside.png"):
-    case(f"a photo {name}", "import", import_that_names(name), item=2)
-case(
-    "a photo that is a link outwards", "import",
-    import_that_names("l.png", lambda inner: (inner / "photos" / "l.png").symlink_to(inner.parent / "outside.png")), item=2,
-)  # fmt: skip
-
-
-def camera_named(name):
-    def make(folder):
-        honest.write_import(folder)
-        (folder / "cameras.json").write_text(
-            json.dumps({name: {"K": honest.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}})
-        )
-        return folder / "cameras.json"
-
-    return make
-
-
+    case(f"a photo {name}", "import", import_of("transforms.json", one_frame(name)), item=2)
+case("a photo that is a link outwards", "import", import_of("transforms.json", one_frame("l.png"), link=True), item=2)
 for name in ("..", "../..", "/", "/tmp", "x\0y"):
-    case(f"a camera {name!r}", "import", camera_named(name), item=2)
+    camera = {"K": honest.K, "R": np.eye(3).tolist(), "T": [0, 0, 3], "imgSize": [10, 12]}
+    case(f"a camera {name!r}", "import", import_of("cameras.json", {name: camera}), item=2)
 
 
 # Captures and folders of photos that cost more than they weigh ------------------------------------------------------------------
@@ -106,54 +81,34 @@ for name in ("..", "../..", "/", "/tmp", "x\0y"):
 
 def capture_of(count, prepare=lambda folder: None, image="images/000.png", **changes):
     """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
-
-    def make(folder):
-        honest.write_capture(folder)
-        prepare(folder)
-        description = honest.capture_description()
-        view = {**description["views"][0], "frame": 0, **changes}
-        del view["mask"]
-        description["views"] = [view | {"image": image.format(i)} for i in range(count)]
-        (folder / "capture.json").write_text(json.dumps(description))
-        return folder
-
-    return make
+    view = {key: value for key, value in honest.capture_description()["views"][0].items() if key != "mask"}
+    views = [view | {"frame": 0, "image": image.format(i)} | changes for i in range(count)]
+    return capture_with({"views": views}, prepare)
 
 
 def large_photo(folder, size=1024):
     Image.fromarray(np.zeros((size, size, 3), np.uint8)).save(folder / "images" / "000.png")
 
 
-def copies(count, link):
-    """Of the large photo, hard or symbolic links."""
+def copies(count, link=lambda old, new: new.write_bytes(old.read_bytes()), size=1024):
+    """Of a large photo; hard or symbolic links."""
 
     def prepare(folder):
-        large_photo(folder)
+        large_photo(folder, size)
         for i in range(count):
             link(folder / "images" / "000.png", folder / f"{i}.png")
 
     return prepare
 
 
-def white_photos(folder):
-    large_photo(folder, 7000)
-    for i in range(21):
-        (folder / f"{i}.png").write_bytes((folder / "images" / "000.png").read_bytes())
-
-
-def five_thousand_photos(folder):
-    for i in range(5000):
-        (folder / f"{i}.png").write_bytes((folder / "images" / "000.png").read_bytes())
-
-
-for reader in ("capture", "photos", "boundary"):
+for reader in CAPTURES:
     case("one photo 4,000 times", reader, capture_of(4000, large_photo), item=5)
     case("one photo 100 times", reader, capture_of(100, large_photo), item=5)
     for kind, link in {"links": lambda old, new: new.symlink_to(old), "hard links": os.link}.items():
         case(f"400 {kind} to a photo", reader, capture_of(400, copies(400, link), "{}.png"), item=5)
     if reader != "boundary":  # which reads one after the other
-        case("21 white photos of 49 million pixels", reader, capture_of(21, white_photos, "{}.png"), item=5)
-case("5,000 photos", "photos", capture_of(5000, five_thousand_photos, "{}.png"), item=5)
+        case("21 white photos of 49 million pixels", reader, capture_of(21, copies(21, size=7000), "{}.png"), item=5)
+case("5,000 photos", "photos", capture_of(5000, copies(5000, size=12), "{}.png"), item=5)
 for frame in (2_000_000_000, 10**30, 100_000, 1000):
     case(f"frame {frame}", "photos", capture_of(4, frame=frame), item=5)
 

@@ -1,12 +1,10 @@
-"""Every command that writes, on a full or read-only disk, and twice at once: python disks.py FOLDER [COMMAND ...]
+"""Every command that writes, on a full or read-only disk: python disks.py FOLDER [COMMAND ...]
 
 Disks are mounted in memory where this process may; elsewhere files get a largest size, and folders lose the right to be
 written. A run ends with exit status 0, or with 2 and one line that names the place; then everything is as before, nothing is
-left over, and the next run makes what it should. That a disk is read-only is said before the work begins. Of two runs into one
-place each may be refused so; what is there in the end is what one of them makes.
+left over, and the next run makes what it should. That a disk is read-only is said before the work begins.
 """
 
-import dataclasses
 import json
 import os
 import shutil
@@ -26,7 +24,6 @@ SHARES = (0.0, 0.3, 0.6)
 """Of the bytes of what a command writes: so much is free."""
 LEAST = 1 << 10
 """Bytes that a file may have where no disk can be mounted, at least: what a run says goes to a file, too."""
-PAIRS = 2
 GROWS = ("run", "people", "set", "begun")
 """What training, `synth`, `preprocess` and the stages of `start` have finished stays, and the next run goes on from there."""
 
@@ -126,23 +123,6 @@ def read_only(command: Command, disk: Disk, inputs: Path) -> list[str]:
     return [f"read-only: {fault}" for fault in faults]
 
 
-def pair(command: Command, folder: Path, inputs: Path) -> list[str]:
-    command = dataclasses.replace(command, first="")
-    place, alone = writers.place_of(command, folder, inputs, "pair"), []
-    for variant in (1, 2):
-        own = writers.place_of(command, folder, inputs, f"alone{variant}")
-        assert writers.run(command, own, inputs, variant).code == 0, command.name
-        alone.append(writers.snapshot(own)[0])
-    both = [writers.start(command, place, inputs, variant) for variant in (1, 2)]
-    endings = [writers.end(each) for each in both]
-    faults = [] if any(ending.code == 0 for ending in endings) else ["both failed"]
-    for ending in endings:
-        faults += [] if ending.code == 0 else refused(ending, targets(alone[0]))
-    unlike = [writers.unlike(command, place, state) for state in alone]
-    faults += [] if not all(unlike) else [f"not what one of them makes: {min(unlike, key=len)}"]
-    return [f"two runs: {fault}" for fault in faults]
-
-
 def main():
     folder, names = Path(sys.argv[1]), sys.argv[2:]
     shutil.rmtree(folder, ignore_errors=True)
@@ -156,8 +136,6 @@ def main():
             if names and command.name not in names:
                 continue
             found = full(command, disk, inputs) + read_only(command, disk, inputs)
-            for _ in range(PAIRS):
-                found += pair(command, disk.folder, inputs)
             faults[command.name] = found
             print(json.dumps({command.name: found}), flush=True)
     sys.exit(any(faults.values()))

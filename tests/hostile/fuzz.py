@@ -1,12 +1,11 @@
-"""A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...] [--record FILE]
+"""A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...]
 
 Honest files are taken apart as their format has it (arrays of an archive, values of JSON, instructions of a pickle, chunks of a
 PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
 What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
 
-`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. The record (default: FOLDER/record.json)
-has the figures of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on
-another machine, one with --page docs/security.md, from docs/results/fuzz.json.
+`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. FOLDER/record.json has the figures of each
+reader; a later call goes on from there, and tries what was found again.
 """
 
 import argparse
@@ -18,6 +17,7 @@ import itertools
 import json
 import os
 import pickletools
+import re
 import shutil
 import struct
 import sys
@@ -25,6 +25,7 @@ import time
 import zipfile
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import worker
 
@@ -48,17 +49,27 @@ VALUES = [*NUMBERS, None, True, "", "x", "..", "../x", "/", "a\0b", "1", "nan"]
 VALUES += [[], {}, [1, [2]], {"a": 1}, [[]] * 9, [0.0] * 51]
 DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
 SIZES = (0, 1, 2, 3, 4, 5, 9, 17, 55, 165)
-WORDS = [*b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()]
+WORDS = b"nan inf -1 0 1e400 99999999999999999999 x [ { - !!opencv-matrix !!python/object &a *a %YAML:1.0 # / ..".split()
 WORDS += [b"9" * 400, b"", b"\0", b"\xff", b"\n", b": ", b"f 1 2 3", b"v 1 2 3"]
-OPCODES = [bytes([each.code.encode("latin1")[0]]) for each in pickletools.opcodes]
-STACK = [b"0", b"2", b"(", b"R", b"b", b"\x81", b"\x85", b"\x86", b"t", b"s", b"u", b"e"]
-CONSTANTS = [b"J" + struct.pack("<i", n) for n in (-1, 0, 7, 2**31 - 1)]
-CONSTANTS += [b"N", b"}", b"]", b")", b"X\1\0\0\0<", b"\x88"]
+BYTES = [
+    *(bytes([i]) for i in range(256)),
+    *(end * size for end in (b"\0", b"\xff", b"\x7f", b"\x80") for size in (2, 4, 8)),
+    *WORDS,
+]
 NAMES = """numpy dtype, numpy ndarray, numpy.core.multiarray _reconstruct, numpy.core.multiarray scalar, numpy._core.numeric
 _frombuffer, _codecs encode, scipy.sparse csc_matrix, chumpy.ch Ch, chumpy.reordering Select, copyreg _reconstructor, collections
 OrderedDict, torch FloatStorage, torch.storage _load_from_bytes, joblib.numpy_pickle NumpyArrayWrapper, collections
 defaultdict, torch._utils _rebuild_tensor_v2, torch._utils _rebuild_parameter, os system, builtins object"""
-NAMES = [each.split() for each in NAMES.split(",")]
+INSTRUCTIONS = [each.code.encode("latin1") for each in pickletools.opcodes]
+INSTRUCTIONS += [b"c" + "\n".join((*each.split(), "")).encode() for each in NAMES.split(",")]
+INSTRUCTIONS += [b"J" + struct.pack("<i", n) for n in (-1, 0, 7, 2**31 - 1)] + [b"X\1\0\0\0<"]
+HEADERS = itertools.product((0, 9, 10, 70_000), (0, 12, 2**31), (1, 8, 16), range(8), (0, 1), (0, 1), (0, 1, 2))
+CHUNKS = [(b"IHDR", struct.pack(">IIBBBBB", *header)) for header in itertools.islice(HEADERS, 0, None, 7)]
+CHUNKS += [
+    (name, body)
+    for name in (b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND")
+    for body in (b"", b"\0", bytes(40), b"x\0\0" + zlib.compress(bytes(99)))
+]
 
 
 class Draw:
@@ -79,43 +90,49 @@ class Draw:
         some = [copy.deepcopy(self.of(VALUES)) for _ in range(2 if way > 5 else 1)]
         return some if way == 6 else dict(zip("ab", some, strict=True)) if way == 7 else some[0]
 
+    def exchanged(self, pieces, hostile):
+        """Pieces in a list, or a bytearray, of which a few are left out, doubled, or exchanged for hostile ones."""
+        for _ in range(1 + self.below(4)):
+            at, way, count = self.below(len(pieces) + 1), self.below(4), 1 + self.below(self.of((1, 8, 64)))
+            if way == 0:
+                del pieces[at : at + count]
+            elif way == 1:
+                other = self.below(len(pieces) + 1)
+                pieces[at:at] = pieces[other : other + count]
+            else:
+                new = self.of(hostile) * self.of((1, 1, 1, count))
+                pieces[at : at + len(new) * (way == 2)] = new
+        return pieces
+
 
 def mutated_bytes(data, draw):
-    data = bytearray(data)
-    for _ in range(1 + draw.below(4)):
-        at, way = draw.below(len(data) + 1), draw.below(6)
-        if way == 0 and at < len(data):
-            data[at] ^= 1 << draw.below(8)
-        elif way == 1:
-            data[at : at + 1] = bytes([draw.below(256)])
-        elif way == 2:
-            del data[at : at + 1 + draw.below(64)]
-        elif way == 3:
-            data[at:at] = draw.of(WORDS)
-        elif way == 4:
-            size = draw.of((1, 2, 4, 8))
-            data[at : at + size] = draw.of((b"\0", b"\xff", b"\x7f", b"\x80")) * size
-        else:
-            other = draw.below(len(data) + 1)
-            data[at:at] = data[other : other + 1 + draw.below(200)]
-    return bytes(data)
+    return bytes(draw.exchanged(bytearray(data), BYTES))
 
 
 def mutated_text(data, draw):
-    """Words and lines exchanged, doubled or left out."""
-    words = data.replace(b"\n", b" \n ").split(b" ")
-    for _ in range(1 + draw.below(4)):
-        at, way = draw.below(len(words)), draw.below(4)
-        if way == 0:
-            words[at] = draw.of(WORDS)
-        elif way == 1:
-            del words[at : at + 1 + draw.below(8)]
-        elif way == 2:
-            words[at:at] = words[at : at + 1 + draw.below(40)]
-        else:
-            words[at:at] = [draw.of(WORDS)] * (1 + draw.below(50))
-        words = words or [b""]
-    return b" ".join(words).replace(b" \n ", b"\n")
+    return b"".join(draw.exchanged(re.split(rb"([ \n])", data), [[b" ", word, b" "] for word in WORDS]))
+
+
+def mutated_pickle(data, draw):
+    ends = [place for _, _, place in pickletools.genops(data)] + [len(data)]
+    pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
+    return b"".join(draw.exchanged(pieces, [[each] for each in INSTRUCTIONS]))
+
+
+def mutated_png(data, draw):
+    at, chunks = 8, []
+    while at + 12 <= len(data):
+        length, name = struct.unpack(">I4s", data[at : at + 8])
+        chunks.append((name, data[at + 8 : at + 8 + length]))
+        at += 12 + length
+    at = draw.below(len(chunks))
+    name, body = chunks[at]
+    chunks[at] = draw.of(
+        [(name, mutated_bytes(body, draw)), (name, zlib.compress(mutated_bytes(bytes(400), draw))), (name, body)]
+    )
+    chunks = draw.exchanged(chunks, [[each] for each in CHUNKS])
+    packed = (struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 def places(value, path=()):
@@ -127,8 +144,7 @@ def places(value, path=()):
 
 def mutated_value(value, draw):
     for _ in range(1 + draw.below(3)):
-        found = list(places(value))
-        path = draw.of(found)
+        path = draw.of(list(places(value)))
         if not path:
             return draw.value()
         parent = value
@@ -157,10 +173,8 @@ def mutated_array(array, draw):
         bad = (0, 1, 9, 99) if array.dtype.kind in "iu" else (np.nan, np.inf, -np.inf, -1.0, 6e4)
         array.reshape(-1)[draw.below(array.size)] = draw.of(bad)
         return array
-    if way == 2 and array.dtype.kind in "fiub":
-        return array.astype(draw.of(DTYPES[:9]), copy=False)
     if way == 2:
-        return np.asarray(draw.of(("", "x", "\0")))
+        return array.astype(draw.of(DTYPES[:9])) if array.dtype.kind in "fiub" else np.asarray(draw.of(("", "x", "\0")))
     if way == 3:
         return array[None]
     return array[: draw.below(len(array) + 1)] if array.ndim else np.zeros(3)
@@ -183,28 +197,6 @@ def mutated_npz(data, draw):
     return stream.getvalue()
 
 
-def mutated_pickle(data, draw):
-    ends = [place for _, _, place in pickletools.genops(data)] + [len(data)]
-    pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
-    for _ in range(1 + draw.below(5)):
-        at, way = draw.below(len(pieces)), draw.below(6)
-        if way == 0:
-            del pieces[at : at + 1 + draw.below(3)]
-        elif way == 1:
-            other = draw.below(len(pieces))
-            pieces[at:at] = pieces[other : other + 1 + draw.below(10)]
-        elif way == 2:
-            pieces[at:at] = [draw.of(OPCODES)]
-        elif way == 3:
-            pieces[at] = b"c" + "\n".join((*draw.of(NAMES), "")).encode()
-        elif way == 4:
-            pieces[at] = draw.of(CONSTANTS)
-        else:
-            pieces[at:at] = [draw.of(STACK)] * (1 + draw.below(30))
-        pieces = pieces or [b"."]
-    return b"".join(pieces)
-
-
 def mutated_zip(data, draw):
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -217,38 +209,9 @@ def mutated_zip(data, draw):
     return stream.getvalue()
 
 
-def mutated_png(data, draw):
-    at, chunks = 8, []
-    while at + 12 <= len(data):
-        length, name = struct.unpack(">I4s", data[at : at + 8])
-        chunks.append((name, data[at + 8 : at + 8 + length]))
-        at += 12 + length
-    for _ in range(1 + draw.below(3)):
-        at = draw.below(len(chunks))
-        name, body = chunks[at]
-        way = draw.below(5)
-        if way == 0:
-            size = draw.of((0, 9, 10, 70_000)), draw.of((0, 12, 2**31))
-            body = struct.pack(">IIBB", *size, draw.of((1, 8, 16)), draw.below(8))
-            body += bytes([draw.below(2), draw.below(2), draw.below(3)])
-            chunks[0] = (b"IHDR", body)
-        elif way == 1:
-            name = draw.of((b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND"))
-            chunks[at:at] = [(name, draw.of((b"", b"\0", bytes(40), b"x\0\0" + zlib.compress(bytes(99)))))]
-        elif way == 2:
-            chunks[at] = name, mutated_bytes(body, draw)
-        elif way == 3:
-            chunks[at] = name, zlib.compress(mutated_bytes(bytes(400), draw))
-        else:
-            del chunks[at]
-        chunks = chunks or [(b"IEND", b"")]
-    out = b"\x89PNG\r\n\x1a\n"
-    return out + b"".join(struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
-
-
 def mutated_glb(data, draw):
     length = struct.unpack_from("<I", data, 12)[0]
-    header = json.dumps(mutated_value(json.loads(data[20 : 20 + length]), draw)).encode()
+    header = mutated_json(data[20 : 20 + length], draw)
     header += b" " * (-len(header) % 4)
     chunks = struct.pack("<II", len(header), 0x4E4F534A) + header + data[20 + length :]
     return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
@@ -294,17 +257,11 @@ assert set(STRUCTURES) <= set(readers.FORMATS)
 def checked(read, path, watch):
     """Reads a file. Raises: AssertionError for anything but a result or one line that names the file."""
 
-    class Fuzzed:
-        name = reader = ""
-
-        @staticmethod
-        def make(folder):
-            return path
-
-    result = worker.run(Fuzzed, read, path if path.is_dir() else path.parent, watch, measured=False)
+    folder = path if path.is_dir() else path.parent
+    case = SimpleNamespace(name="", reader="", make=lambda _: path)
+    result = worker.run(case, read, folder, watch, measured=False)
     assert result["outcome"] in ("read", "refused"), f"{result['outcome']}: {result['message']}"
     if result["outcome"] == "refused":
-        folder = path if path.is_dir() else path.parent
         assert str(folder) in result["message"] and "\n" not in result["message"], result["message"]
     return result["outcome"]
 
@@ -353,17 +310,12 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("inputs", type=int)
     parser.add_argument("readers", nargs="*")
-    parser.add_argument("--record", type=Path)
     parser.add_argument("--page", type=Path, help="page whose table fuzz is written, with its docs/results/fuzz.json")
     arguments = parser.parse_args()
     folder, names = arguments.folder, arguments.readers or [name for name, each in readers.FORMATS.items() if each.make]
-    record_file = arguments.record or folder / "record.json"
-    published = arguments.page and arguments.page.parent / "results" / "fuzz.json"
-    record = json.loads(record_file.read_text()) if record_file.exists() else {}
-    if not record and published and published.exists():
-        record = json.loads(published.read_text())["numbers"]
-    fresh = {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0}
-    figures = {name: fresh | record.get(name, {}) | {"found": ""} for name in names}
+    record, fresh = folder / "record.json", {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0}
+    figures = json.loads(record.read_text()) if record.exists() else {}
+    figures |= {name: fresh | figures.get(name, {}) | {"found": ""} for name in names}
     shutil.rmtree(folder / "honest", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     worker.warm_up(readers, folder)
@@ -375,9 +327,7 @@ def main():
         chunk = min(CHUNK, arguments.inputs - own["inputs"])
         for key, value in fuzz(name, folder, chunk, own["chunks"], watch).items():
             own[key] = round(own[key] + value, 1) if key != "found" else value
-        replacement = record_file.with_suffix(".new")
-        replacement.write_text(json.dumps(record | figures, indent=1) + "\n")
-        replacement.replace(record_file)
+        record.write_text(json.dumps(figures, indent=1) + "\n")
         if own["found"]:
             print(f"{name}: {own['found']}", flush=True)
         jax.clear_caches()
@@ -385,7 +335,7 @@ def main():
         if Path("/proc/self/maps").read_bytes().count(b"\n") > MOST_MAPPINGS:
             os.execv(sys.executable, [sys.executable, *sys.argv])
     if arguments.page is not None:
-        write_page(arguments.page, record | figures)
+        write_page(arguments.page, figures)
     print(json.dumps(figures))
 
 

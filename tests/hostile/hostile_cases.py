@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import honest_files as honest
 import numpy as np
 from changes import edit_bytes, edit_text
 from honest_files import written as written
@@ -37,24 +36,42 @@ def case(name, reader, make, expect="refused", item=0):
     CASES.append(Case(f"{reader}: {name}", reader, make, expect, item))
 
 
-def setting(path, value):
-    """Changes one value of the JSON: path as in "accessors.0.count"."""
+def setting(changes):
+    """Changes values of some JSON: each by its path, as in "accessors.0.count"."""
 
     def change(content):
-        *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-        for part in parents:
-            content = content[part]
-        content[last] = value
+        for path, value in changes.items():
+            *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+            place = content
+            for part in parents:
+                place = place[part]
+            place[last] = value
+        return content
 
     return change
 
 
-def described(description):
-    """A capture with another description."""
+def json_case(kind, reader, changes, item=6, expect="refused"):
+    """The honest JSON of a reader with some values changed, by path."""
+    change = setting(changes)
+    case(kind, reader, changed(reader, lambda data: json.dumps(change(json.loads(data))).encode()), expect, item)
+
+
+def capture_with(changes=None, prepare=lambda folder: None, photo=None):
+    """An honest capture with some values of its description changed, by path, after something else was done to its folder.
+
+    changes: values, or a function of the folder that returns them. photo: the bytes of the first one.
+    """
 
     def make(folder):
-        honest.write_capture(folder)
-        (folder / "capture.json").write_text(json.dumps(description))
+        folder = folder / "me"
+        folder.mkdir()
+        FORMATS["capture"].make(folder)
+        prepare(folder)
+        if photo is not None:
+            (folder / "images" / "000.png").write_bytes(photo)
+        change = setting(changes(folder) if callable(changes) else changes or {})
+        edit_bytes(folder / "capture.json", lambda data: json.dumps(change(json.loads(data))).encode())
         return folder
 
     return make

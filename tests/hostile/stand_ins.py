@@ -21,10 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from dataset_files import write_avatarrex, write_model
-from honest_files import bank_arrays, sphere, write_import
+from honest_files import sphere, write_import
 
 from humangs_jax.apps.quick_check import Faults
-from humangs_jax.apps.settings import Cost, Tuned, load_front
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, shape_body
@@ -42,7 +41,6 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
-from humangs_jax.people.bank import PeopleBank
 from humangs_jax.refinement.refine import Refinement
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import Rendering
@@ -50,7 +48,7 @@ from humangs_jax.training import config
 from humangs_jax.training.forward import METRICS
 
 HEAVY = (
-    *("apps.check", "apps.demo", "apps.settings", "avatar.frames", "avatar.layers", "avatar.video"),
+    *("apps.check", "apps.demo", "avatar.frames", "avatar.layers", "avatar.video"),
     *("data.calibration.importing", "people.writer", "refinement.refine", "training.diagnose", "viewer.page"),
     *("fitting.fit_capture", "fitting.refine", "fitting.scan_files", "network.conversion"),
 )
@@ -59,7 +57,7 @@ for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
     importlib.import_module(name)
 WORK = {
     *("reconstruct", "refine_with_report", "motion_frames", "images", "draw", "fit_photos", "refine_capture"),
-    *("fit_scan", "load_checkpoint", "make_subject", "train_step", "build_bank", "tune"),
+    *("fit_scan", "load_checkpoint", "make_subject", "train_step"),
 }
 """Stand-ins for what takes long: nothing that is wrong with the place may be found only after these."""
 
@@ -165,15 +163,6 @@ def stand_ins(variant):
     def validated(_variables, _body, examples, *_):
         return dict.fromkeys(METRICS, 20.0), [np.asarray(example.targets.images) for example in examples]
 
-    def bank(seeds, *_, **__):
-        arrays = bank_arrays()
-        names = {field.name for field in dataclasses.fields(PeopleBank)}
-        plain = {name: int(arrays[name]) if name == "generator" else arrays[name] for name in names & set(arrays)}
-        return PeopleBank(**plain | {"split": "train", "seeds": np.asarray(seeds, np.int32)} | tuples(arrays))
-
-    def tuples(arrays):
-        return {name: tuple(arrays[name].tolist()) for name in ("parents", "mirrored_joints")}
-
     def shown(vertices, faces, tints, camera):
         image = random_of(variant, 3).random((camera.height, camera.width))
         return SimpleNamespace(shaded=np.repeat(image[..., None], 3, -1), covered=image > 0.5)
@@ -195,9 +184,6 @@ def stand_ins(variant):
 
     def scored(images, _truth, rules, *_):
         return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
-
-    def tuned(*_, **__):
-        return Tuned(load_front()[variant], Cost(variant, 0.0, 1.0), load_front()[variant], {})
 
     mesh_views = lambda *_: iter([(np.full((32, 32, 3), variant / 4), np.ones((32, 32)))] * 8)
     avatar = lambda *_, **__: Avatar.load(Path(os.environ["KILLS_INPUTS"]) / f"avatar{variant}.npz")
@@ -223,7 +209,6 @@ def stand_ins(variant):
         "apps.demo.painted_body": lambda _: None,
         "apps.demo.draw_painted_body": lambda *_: None,
         "apps.demo.motion_frames": frames,
-        "apps.settings.tune": tuned,
         "evaluation.run.score_views": scored,
         "fitting.fit_capture.fit_photos": fitted,
         "fitting.refine.refine_capture": refined,
@@ -240,10 +225,6 @@ def stand_ins(variant):
         "training.loop.init_state": state,
         "training.loop.gaussian_body": lambda body, _: body,
         "training.loop.validate": validated,
-        "training.sources.build_bank": bank,
-        "training.sources.on_the_fly_people": lambda _: importlib.import_module("humangs_jax.training.sources").captured_people(
-            [Path(os.environ["KILLS_INPUTS"]) / "people" / "a"], load_body()
-        ),
     }
 
 

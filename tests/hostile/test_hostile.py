@@ -1,7 +1,7 @@
 """Hostile files end in one line, in bounded memory and time, and nothing else happens; every command that writes loses nothing.
 
 Some files of each item are read here, all of them in a process of their own (`worker`), by the slow tests. So are the commands:
-killed, on full and read-only disks, twice at once (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
+killed, and on full and read-only disks (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
 prints the figures of docs/security.md.
 """
 
@@ -136,33 +136,34 @@ def test_the_fuzzer_finds_nothing(tmp_path):
     assert len(figures) >= 45 and all(each["inputs"] >= FUZZED for each in figures.values())
 
 
+def disturbed(folder, *options):
+    """Figures of every command."""
+    record = folder / "figures.json"
+    done = program("kills.py", folder / "kills", "--count", MOMENTS, "--json", record, *options)
+    assert record.exists(), done.stderr[-3000:]
+    figures = json.loads(record.read_text())
+    assert not {name: each["faults"] for name, each in figures.items() if each["faults"]}
+    assert done.returncode == 0 and len(figures) >= 19, done.stderr[-3000:]
+    return figures
+
+
 @pytest.mark.slow
 def test_killed_at_any_moment_nothing_is_half_written_or_lost_and_the_next_run_works(tmp_path):
-    record = tmp_path / "kills.json"
-    done = program("kills.py", tmp_path / "kills", "--moments", MOMENTS, "--json", record)
-    assert record.exists(), done.stderr[-3000:]
-    commands = json.loads(record.read_text())["commands"]
-    assert not {name: each["faults"] for name, each in commands.items() if each["faults"]}
-    assert done.returncode == 0 and len(commands) >= 25
-    killed = sum(each["killed"] for each in commands.values())
-    assert killed > MOMENTS * len(commands) / 2  # some come to their end before
+    commands = disturbed(tmp_path)
+    assert sum(each["killed"] for each in commands.values()) > MOMENTS * len(commands) / 2  # some come to their end before
 
 
 @pytest.mark.slow
 def test_interrupted_at_any_moment_a_command_exits_with_130_and_leaves_nothing(tmp_path):
-    record = tmp_path / "interrupts.json"
-    done = program("kills.py", tmp_path / "kills", "--interrupts", MOMENTS, "--json", record)
-    figures = json.loads(record.read_text())
-    assert not {name: each["faults"] for name, each in figures.items() if each["faults"]}
-    assert done.returncode == 0 and len(figures) >= 25, done.stderr[-3000:]
+    assert any(each["interrupted"] for each in disturbed(tmp_path, "--interrupts").values())
 
 
 @pytest.mark.slow
-def test_full_and_read_only_disks_and_two_runs_at_once_end_in_one_line_and_lose_nothing(tmp_path):
+def test_full_and_read_only_disks_end_in_one_line_and_lose_nothing(tmp_path):
     done = program("disks.py", tmp_path / "disks")
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert not [each for each in found if any(each.values())]
-    assert done.returncode == 0 and len(found) >= 25, done.stderr[-3000:]
+    assert done.returncode == 0 and len(found) >= 19, done.stderr[-3000:]
 
 
 def main():

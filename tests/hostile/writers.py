@@ -58,11 +58,9 @@ class Command:
 CAPTURE = "--keypoints {inputs}/keypoints.npz --overwrite"
 RUN = ("run/checkpoints/*", "run/tensorboard/*")
 SYNTH = "synth --out people --subjects {} --size 128 --views 2 --close-views 0 --workers 1 --held-out 1"
-TRAIN = {"first": None, "varies": ("run/log.jsonl",), "own": RUN, "often": ("run/*.safetensors",)}
 COMMANDS = (
     Command("import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
-    Command("fit elsewhere", f"fit {{inputs}}/capture {CAPTURE} --out fitted"),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
     Command("fit --scan", "fit --scan {inputs}/scan.obj --out body --overwrite"),
     Command("fit --scan --scan-views", "fit --scan {inputs}/scan.obj --scan-views views", first=None, once=True),
@@ -70,18 +68,19 @@ COMMANDS = (
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
     Command("reconstruct", "reconstruct {inputs}/capture --out me.npz --no-check"),
     Command("refine", "refine {inputs}/avatar1.npz {inputs}/capture --limit 1steps --out me.npz --no-check"),
-    Command("tune", "tune {inputs}/capture --frame-ms 50 --out tuned.json"),
     Command("animate mp4", "animate {inputs}/avatar1.npz --out me.mp4 --size 16"),
-    Command("animate gif", "animate {inputs}/avatar1.npz --out me.gif --size 16"),
     Command("render", "render {inputs}/avatar1.npz --out views --views 3 --size 16 --exr"),
-    Command("render anew", "render {inputs}/avatar1.npz --out views --views 3 --size 16", first=None),
     Command("export ply", "export {inputs}/avatar{v}.npz --out me.ply"),
-    Command("export splat", "export {inputs}/avatar{v}.npz --out me.splat"),
-    Command("export glb", "export {inputs}/avatar{v}.npz --out me.glb"),
     Command("export html", "export {inputs}/avatar{v}.npz --html me.html"),
     Command("synth", SYNTH.format(2), first=SYNTH.format(1)),
-    Command("train", "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people", **TRAIN),
-    Command("train --on-the-fly", "train --out run --on-the-fly 2 --config {inputs}/train.json", **TRAIN),
+    Command(
+        "train",
+        "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people",
+        first=None,
+        varies=("run/log.jsonl",),
+        own=RUN,
+        often=("run/*.safetensors",),
+    ),
     Command(
         "start",
         "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints {inputs}/keypoints.npz --out begun "

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -253,11 +252,11 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
     thesis.write_text("dear")
     (tmp_path / "docs" / "deep").mkdir()
     (tmp_path / "docs" / "deep" / "b.txt").write_text("b")
-    assert atomic.contents(folder) == "a.txt, deep (1 file), thesis.tex" and atomic.contents(tmp_path / "none") == ""
+    assert atomic.contents(folder) == "a.txt, deep, thesis.tex" and atomic.contents(tmp_path / "none") == ""
     never = lambda temporary: pytest.fail("the work has begun")
     with pytest.raises(ValueError, match=r"holds no capture\.json: refusing"):
         atomic.replace_folder(folder, never, mark="capture.json")
-    with pytest.raises(ValueError, match=r"which deletes a\.txt, deep \(1 file\), thesis\.tex"):
+    with pytest.raises(ValueError, match=r"which deletes a\.txt, deep, thesis\.tex"):
         atomic.check_replaceable(folder, overwrite=False, mark=MARK)
     atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "scan.obj", None))
     (tmp_path / "link").symlink_to(thesis)
@@ -277,24 +276,6 @@ def test_places_where_nothing_can_be_written_are_refused_before_the_work(tmp_pat
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     with pytest.raises(ValueError, match="cannot be written to"):
         atomic.check_replaceable(tmp_path / "deep" / "folder")
-
-
-def test_several_writers_of_one_folder_end_with_one_of_theirs(tmp_path):
-    failed, target = [], tmp_path / "folder"
-
-    def write(number):
-        try:
-            for _ in range(20):
-                atomic.replace_folder(target, writes(str(number)), mark=MARK)
-        except Exception as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failed == [] and names(tmp_path) == ["folder"] and (target / "a.txt").read_text() in "0123"
 
 
 WRITE_FOR_EVER = """
