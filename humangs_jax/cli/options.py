@@ -106,7 +106,7 @@ def described(command: type[Any]) -> type[Any]:
             shown = name if field.default is dataclasses.MISSING else f"[{name}]"
         quiet = field.default in (None, ()) or kind is bool
         seen = arg(metavar=shown, help_behavior_hint="" if quiet else None)
-        command.__annotations__[field.name] = Annotated[hint, seen]  # ty: ignore[invalid-type-form]
+        command.__annotations__[field.name] = Annotated[hint, seen]
     return command
 
 

@@ -181,7 +181,7 @@ def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = Fals
         elif kind == "obj":  # text of other encodings would be guessed at for a long time
             stream = io.StringIO(_grouped(data.decode("utf-8", "replace"), painted))
         materials: dict[str, Any] = {} if kind in ("stl", "off") else {"skip_materials": not painted}
-        resolver = _Folder(path.parent) if painted else None
+        resolver: Any = _Folder(path.parent) if painted else None
         # processing would silently drop what is not finite
         scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, **materials)
         if resolver is not None:
