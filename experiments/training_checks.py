@@ -280,7 +280,6 @@ def own_case(names: list[str], side: int = SIDE) -> tuple[Any, Any]:
         "spread": 0.1 * uniform(*pixels),
         "opacities": uniform(3 * vertices),
         "tight_offsets": rng.normal(size=(vertices, 1, 3)),
-        "shell_spread": uniform(vertices, 3),
     }
     images, masks = jnp.asarray(uniform(*pixels, 3)), jnp.asarray(uniform(*pixels))
     depths = jnp.asarray(depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, pixels))
@@ -293,7 +292,7 @@ def own_case(names: list[str], side: int = SIDE) -> tuple[Any, Any]:
         one = lambda rgb, alpha, depth: Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32))
         rendering = jax.vmap(one)(point["rgb"], alpha, mean)
         spread = ray_spread(alpha, mean, mean**2 + point["spread"])
-        drawn = Drawn(rendering, spread, point["opacities"], point["tight_offsets"], point["shell_spread"])
+        drawn = Drawn(rendering, spread, point["opacities"], point["tight_offsets"])
         return loss_terms(drawn, images, masks, depths, config, networks)
 
     return values, point

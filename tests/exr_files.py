@@ -3,8 +3,11 @@
 import numpy as np
 import OpenEXR
 
-from humangs_jax.avatar.layers import RGBA, STANDARD_ATTRIBUTES, ExrView
+from humangs_jax.avatar.layers import RGBA, ExrView
 from humangs_jax.geometry.camera import Camera
+
+STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
+"""Header strings with a meaning of their own in OpenEXR."""
 
 
 def read_exr(path):
@@ -21,6 +24,6 @@ def camera_of(view):
 def _view(part):
     images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
     rgba = np.stack([images.pop(name) for name in RGBA], axis=-1)
-    matrices = [part.header.get(key) for key in ("K", "cam_from_world")]
+    matrices = [part.header[key] for key in ("K", "cam_from_world")]
     attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
     return ExrView(rgba, images.pop("Z", None), *matrices, part.name(), images, attributes)

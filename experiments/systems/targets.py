@@ -70,8 +70,8 @@ class GaussianDriver(Driver):
 
         posed, offsets = jax.lax.map(one, (targets.rotations, targets.translations))
         flat = lambda x: None if x is None else x.reshape(-1, *x.shape[2:])
-        found = draw_posed(posed, targets, backgrounds, config)._replace(opacities=flat(posed.opacities))
-        return found._replace(tight_offsets=flat(offsets), shell_spread=outputs.shell_spread)
+        found = draw_posed(posed, targets, backgrounds, config)
+        return found._replace(opacities=flat(posed.opacities), tight_offsets=flat(offsets))
 
     @nn.nowrap
     def show(

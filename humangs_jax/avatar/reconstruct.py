@@ -4,9 +4,11 @@ Programs are compiled once per bucket: numbers of views and of foreground tokens
 (`buffers.round_up`), and padding is masked.
 """
 
+import contextlib
+import functools
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ import numpy as np
 from humangs_jax.avatar.animate import with_low_pass
 from humangs_jax.avatar.avatar import Avatar, Light, light_coefficients, light_terms, log_brightness, turned_normals
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, blend_transforms, joint_transforms, spread_weights
-from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.checks import FINITE, UNIT, check_values, checked_arguments
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import displacement
@@ -46,6 +48,7 @@ from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
+POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
 """Captures of `reconstruct_many` at a time: beyond it memory grows, and little else."""
 
@@ -86,7 +89,7 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     if (bucket := round_up(count, smallest=1)) > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
-    _check_posed(inputs.posed_vertices, "capture")
+    check_values("reconstruct: capture", {POSED: (inputs.posed_vertices, FINITE)})
     avatar, _ = _reconstruct(variables, fit_buffers(inputs.foreground, inputs.view_count, config), body, views, inputs)
     return replace(avatar, light=None) if turned else avatar
 
@@ -133,8 +136,8 @@ class Reconstructed(NamedTuple):
     """A capture by name with its avatar, or with what is wrong with it."""
 
     name: str
-    capture: Capture | None
-    avatar: Avatar | None
+    capture: Capture | None = None
+    avatar: Avatar | None = None
     error: Exception | None = None
 
 
@@ -149,37 +152,26 @@ def reconstruct_many(
     """
     names, batch = list(captures), batch or BATCH
     for start in range(0, len(names), batch):
-        done = [_loaded(name, captures[name]) for name in names[start : start + batch]]
+        done = [_tried(Reconstructed(name), "capture", captures[name]) for name in names[start : start + batch]]
         good = [each.capture for each in done if each.capture is not None]
-        avatars: list[Avatar | Exception] = []
+        avatars: Iterator[Avatar] = iter(())
         if len(good) > 1:
-            try:
-                avatars = list(reconstruct_batch(variables, config, good))
-            except ValueError:  # of one of them: which one is found below
-                avatars = []
-        avatars = avatars or [_alone(variables, config, capture) for capture in good]
-        following = iter(avatars)
+            with contextlib.suppress(ValueError):  # of one of them: which one is found below
+                avatars = iter(reconstruct_batch(variables, config, good))
         for each in done:
             if each.capture is None:
                 yield each
-            elif isinstance(result := next(following), Avatar):
-                yield each._replace(avatar=result)
             else:
-                yield each._replace(error=result)
+                alone = functools.partial(reconstruct, variables, config, each.capture)
+                avatar = next(avatars, None)
+                yield each._replace(avatar=avatar) if avatar is not None else _tried(each, "avatar", alone)
 
 
-def _loaded(name: str, load: Callable[[], Capture]) -> Reconstructed:
+def _tried(each: Reconstructed, field: str, make: Callable[[], Any]) -> Reconstructed:
     try:
-        return Reconstructed(name, load(), None)
+        return each._replace(**{field: make()})
     except (ValueError, OSError) as error:
-        return Reconstructed(name, None, None, error)
-
-
-def _alone(variables: Variables, config: HumanGSConfig, capture: Capture) -> Avatar | Exception:
-    try:
-        return reconstruct(variables, config, capture)
-    except ValueError as error:
-        return error
+        return each._replace(error=error)
 
 
 @checked_arguments
@@ -231,7 +223,7 @@ def _stacked(config: HumanGSConfig, captures: Sequence) -> tuple[BodyModel, Subj
         subjects.append(replace(views, betas=betas, displacement=displaced))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
-    _check_posed(inputs.posed_vertices, "captures")
+    check_values("reconstruct: captures", {POSED: (inputs.posed_vertices, FINITE)})
     return body, batch, fit_buffers(inputs.foreground, inputs.view_count, config), turned
 
 
@@ -428,18 +420,8 @@ def _check(capture: Capture, name: str) -> None:
     check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
 
 
-def _check_posed(vertices: Float[Array, "*b v n 3"], name: str) -> None:
-    """The other arrays of a body are large, and each of them moves vertices."""
-    try:
-        check_values(f"reconstruct: {name}", {"the posed vertices": (vertices, FINITE)})
-    except ValueError as error:
-        raise ValueError(f"{error}; are the arrays of its body finite?") from error
-
-
 def _equal(body: BodyModel, other: BodyModel) -> bool:
-    if jax.tree.structure(body) != jax.tree.structure(other):
-        return False
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(body), jax.tree.leaves(other), strict=True))
+    return jax.tree.structure(body) == jax.tree.structure(other) and jax.tree.all(jax.tree.map(np.array_equal, body, other))
 
 
 _prepare = jax.jit(prepare_inputs)

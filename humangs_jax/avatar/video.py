@@ -248,20 +248,14 @@ def side_by_side(
     *,
     labels: Sequence[str] | None = None,
 ) -> None:
-    """Write a PNG with truth, ours and the error of every view, and the scale of the error below.
-
-    labels: one per view.
-
-    Raises: ValueError if there is no view.
-    """
+    """Write a PNG with truth, ours and the error of every view, and the scale of the error below. labels: one per view."""
     errors = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])
     headers = ("truth", "ours", "error")
     columns = 3 if len(truth) <= 3 else 6
     texts = None if labels is None else [text for label in labels for text in (label, "", "")]
     sheet = tile(triples, labels=texts, headers=headers * (columns // 3), columns=columns)
-    scale = error_legend(sheet.shape[1], _text_height(truth.shape[2]), LARGEST_ERROR)
-    write_png(path, np.concatenate([sheet, scale]))
+    write_png(path, np.concatenate([sheet, error_legend(sheet.shape[1], _text_height(truth.shape[2]))]))
 
 
 def tile(
@@ -276,19 +270,9 @@ def tile(
     Arguments:
         labels: one per image, written above it; what does not fit is cut off. headers: one per column.
         columns: images in a row; about as many as rows if left out.
-
-    Raises: ValueError if there is no image, or the number of labels or headers does not fit.
     """
     count, height, width = images.shape[:3]
-    if count == 0:
-        raise ValueError("images: expected at least one, got none")
-    columns = int(np.ceil(np.sqrt(count))) if columns is None else min(columns, max(count, 1))
-    if columns < 1:
-        raise ValueError(f"columns: expected at least 1, got {columns}")
-    if labels is not None and len(labels) != count:
-        raise ValueError(f"labels: expected {count}, one per image, got {len(labels)}")
-    if headers is not None and len(headers) != columns:
-        raise ValueError(f"headers: expected {columns}, one per column, got {len(headers)}")
+    columns = int(np.ceil(np.sqrt(count))) if columns is None else min(columns, count)
     text = _text_height(width)
     strip = 0 if labels is None else text + 2 * GAP
     top = 0 if headers is None else text + 2 * GAP
@@ -323,19 +307,18 @@ def write_texts(
 
 def error_colors(errors: Float[np.ndarray, "*shape"], largest: float | int) -> Float[np.ndarray, "*shape 3"]:
     """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
-    if not largest > 0:
-        raise ValueError(f"largest error: expected a positive number, got {largest}")
     stops = np.linspace(0, largest, len(ERROR_COLORS))
     return np.stack([np.interp(errors, stops, channel) for channel in zip(*ERROR_COLORS, strict=True)], axis=-1)
 
 
-def error_legend(width: int, text_height: int, largest: float | int) -> Float[np.ndarray, "height width 3"]:
+def error_legend(width: int, text_height: int) -> Float[np.ndarray, "height width 3"]:
     """A strip with the scale of `error_colors` and its ends in numbers."""
     legend = np.ones((2 * GAP + text_height, width, 3))
     left, right = width // 3, max(2 * width // 3, width // 3 + 2)
-    legend[GAP : GAP + text_height, left:right] = error_colors(np.linspace(0, largest, right - left), largest)
+    scale = np.linspace(0, LARGEST_ERROR, right - left)
+    legend[GAP : GAP + text_height, left:right] = error_colors(scale, LARGEST_ERROR)
     texts = [("absolute error: 0", max(left - 9 * text_height, GAP), GAP // 2, left - GAP)]
-    texts += [(f"{largest:g} and more", right + GAP, GAP // 2, width - right - GAP)]
+    texts += [(f"{LARGEST_ERROR:g} and more", right + GAP, GAP // 2, width - right - GAP)]
     return write_texts(legend, texts, text_height)
 
 

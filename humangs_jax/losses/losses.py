@@ -55,8 +55,6 @@ class LossConfig:
     """Spread of the weights along the rays."""
     opaque: Weight = 0.0
     """4 o (1 - o) of the opacities o."""
-    shells: Weight = 0.0
-    """Spread of the distances that a Gaussian mixes, normalised units."""
     random_background: Share = 0.5
     """Share of the targets that are seen against one random color instead of white, so that white Gaussians differ from missing
     ones."""
@@ -89,8 +87,6 @@ def loss_terms(
         losses["opaque"] = translucency(opacities)
     if opacities is not None and config.distortion:
         losses["distortion"] = _needed(drawn.spread, "distortion", "spread of the rays")
-    if opacities is not None and config.shells:
-        losses["shells"] = _needed(drawn.shell_spread, "shells", "shell of the reader")
     if opacities is not None and config.depth:
         true = _needed(depths, "depth", "depth of the targets")
         losses["depth"] = surface_distance(drawn.rendering.depth, alpha, true, masks)

@@ -167,17 +167,16 @@ class HumanGSOutputs:
 
     gaussians: metric. Without `skinning_weights` g = n * k of them, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from
     the vertex, or of each Gaussian from where it belongs, normalised units (for the tightness loss, which is 0 for None).
-    shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None without shells. skinning_offsets:
-    (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground
-    patches for which the token capacity had no room. skinning_weights: (g, j), rows of sum 1, of Gaussians that do not belong to
-    one vertex each; None: the body's. scene: what a driver works from for every target: the features, unless a decoder sets it.
+    skinning_offsets: (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`).
+    dropped_tokens: foreground patches for which the token capacity had no room. skinning_weights: (g, j), rows of sum 1, of
+    Gaussians that do not belong to one vertex each; None: the body's. scene: what a driver works from for every target: the
+    features, unless a decoder sets it.
     """
 
     gaussians: Gaussians
     tight_offsets: Float[Array, "n t 3"] | None = None
     skinning_offsets: Float[Array, "g j"] | None = None
     dropped_tokens: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
-    shell_spread: Float[Array, "n k"] | None = None
     skinning_weights: Float[Array, "g j"] | None = None
     scene: PyTree = None
 
@@ -202,15 +201,14 @@ class Target(NamedTuple):
 class Drawn(NamedTuple):
     """Images of the v targets of one subject, and what losses compare besides.
 
-    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities: (g,), tight_offsets,
-    shell_spread: of the Gaussians that were drawn; opacities None: there were none, and no alpha or depth either.
+    spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight. opacities: (g,), tight_offsets: of the
+    Gaussians that were drawn; opacities None: there were none, and no alpha or depth either.
     """
 
     rendering: Rendering
     spread: Float[Array, "v h w"] | None = None
     opacities: Float[Array, " g"] | None = None
     tight_offsets: Float[Array, "n t 3"] | None = None
-    shell_spread: Float[Array, "n k"] | None = None
 
 
 class Encoder(Part, nn.Module):

@@ -105,7 +105,6 @@ class VertexDecoder(Decoder):
         return HumanGSOutputs(
             gaussians,
             tight_offsets=made.offsets[:, : self.tight],
-            shell_spread=None if raw.shells is None else shell_spread(raw.shells, features),
             skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
         )
 
@@ -221,13 +220,6 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
             raise ValueError("decoder.residual_color needs a reader that gives photo_colors")
         colors = colors + inverse_sigmoid(seen, COLOR_MARGIN)
     return VertexGaussians(offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors))
-
-
-def shell_spread(logits: Float[Array, "n k s"], features: VertexFeatures) -> Float[Array, "n k"]:
-    """Variance of the shells' distances under the weights of each Gaussian, normalised units."""
-    assert features.shells is not None
-    chosen, distances = jax.nn.softmax(logits, axis=-1), features.shells.distances
-    return _mean(chosen, distances**2) - _mean(chosen, distances) ** 2
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:

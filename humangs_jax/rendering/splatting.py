@@ -39,8 +39,6 @@ from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.projection import ProjectedGaussians, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import (
-    Footprints,
-    Squares,
     TileGrid,
     depth_order,
     emit_pairs,
@@ -334,23 +332,13 @@ def _draw(
     seen = jnp.concatenate(seen, axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
-    features, transmittance, peaks, overflow = _draw_tiles(footprints, splats, grid, config)
-    visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
-    return _blended(features, transmittance, grid, background, nearest, overflow, visibility)
-
-
-def _draw_tiles(
-    footprints: Footprints | Squares, splats: Array, grid: TileGrid, config: SplatConfig
-) -> tuple[Array, Array, Array, Array]:
-    """Tiles of premultiplied features (t, 4 + n, p) and the final T (t, 1, p), largest weights (g,), overflow.
-
-    Footprints and splats in depth order.
-    """
     assert config.max_pairs is not None  # callers have fitted the buffers
     pairs = emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
     features, transmittance, peaks = composite(splats, lists, grid, config)
-    return features, transmittance[:, None], lax.stop_gradient(peaks), pairs.overflow
+    peaks = lax.stop_gradient(peaks)
+    visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
+    return _blended(features, transmittance[:, None], grid, background, nearest, pairs.overflow, visibility)
 
 
 def _blended(

@@ -9,7 +9,7 @@ A rasterizer uses it in five steps, all with static shapes and none of them diff
    empty tiles come last and are never visited.
 4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of `tile_size`^2 values, row by row, at
    `grid.offsets` from the tile's centre in `grid.centers`.
-5. `tiles_to_image`, and `image_to_tiles` for gradients.
+5. `tiles_to_image`.
 
 What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where the last row and column of
 tiles reach beyond the image, those pixels are cut off.
@@ -75,12 +75,6 @@ class TileGrid:
         pixel = np.arange(self.pixels)
         offsets = np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
         return offsets.astype(dtype)
-
-    def centers(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
-        """(t, 2): x and y of the tiles' centres, pixels."""
-        tile = np.arange(self.tiles)
-        corners = np.stack([tile % self.columns, tile // self.columns], axis=-1) * self.tile_size
-        return (corners + self.tile_size / 2).astype(dtype)
 
 
 class Expansion(NamedTuple):
@@ -225,16 +219,8 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
     return TileBlocks(tiles, (used + block - 1) // block)
 
 
-def image_to_tiles(image: Float[Array, "h w c"], grid: TileGrid) -> Float[Array, "t c p"]:
-    """The pixels of each tile, channel by channel; 0 beyond the image."""
-    size, c = grid.tile_size, image.shape[-1]
-    image = jnp.pad(image, ((0, grid.rows * size - grid.height), (0, grid.columns * size - grid.width), (0, 0)))
-    tiles = image.reshape(grid.rows, size, grid.columns, size, c).transpose(0, 2, 4, 1, 3)
-    return tiles.reshape(grid.tiles, c, grid.pixels)
-
-
 def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array, "h w c"]:
-    """Inverse of `image_to_tiles`; pixels beyond the image are cut off."""
+    """The image of the pixels of each tile; pixels beyond it are cut off."""
     size, c = grid.tile_size, tiles.shape[1]
     image = tiles.reshape(grid.rows, grid.columns, c, size, size).transpose(0, 3, 1, 4, 2)
     return image.reshape(grid.rows * size, grid.columns * size, c)[: grid.height, : grid.width]

@@ -84,8 +84,7 @@ def draw_targets(
 
     posed = stage("posed Gaussians", pose, outputs)
     drawn = draw_posed(posed, targets, backgrounds, config)
-    drawn = drawn._replace(opacities=outputs.gaussians.opacities, tight_offsets=outputs.tight_offsets)
-    return drawn._replace(shell_spread=outputs.shell_spread)
+    return drawn._replace(opacities=outputs.gaussians.opacities, tight_offsets=outputs.tight_offsets)
 
 
 def draw_posed(posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig) -> Drawn:

@@ -223,13 +223,6 @@ def test_light_shines_from_above_in_a_capture_of_another_world(body, network):
         np.testing.assert_allclose(got, expected, atol=TURNED)
 
 
-def test_people_who_lie_before_upright_cameras_are_left_lying(body):
-    """The person alone says nothing about the world; that of captures has y up."""
-    views = standardize(capture(body, SIZE, SIZE), SIZE)
-    lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
-    assert lying.upright(body) is lying
-
-
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     """The masks say where the person is; the pixel at which a camera shows a point has the same color before and after."""
     photos = capture(body, 48, 36)
@@ -272,13 +265,6 @@ def test_a_body_that_was_read_twice_is_remeshed_once(body):
     assert gaussian_body(replace(body, name="another"), config).name == "another"
 
 
-def test_the_size_of_the_photos_is_a_choice_of_execution():
-    config = tiny().with_runtime(image_size=64)
-    assert (tiny().image_size, config.image_size, config.conventions.image_size) == (32, 64, 32)
-    with pytest.raises(ValueError, match="image_size 33 is not a multiple of patch_size"):
-        tiny().with_runtime(image_size=33)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -287,7 +273,7 @@ def test_the_size_of_the_photos_is_a_choice_of_execution():
         (lambda c: {"cameras": c.cameras[0]}, r"cameras\.K: expected shape \(2, 3, 3\), got \(3, 3\)"),
         (lambda c: {"cameras": jax.tree.map(lambda x: x[:1], c.cameras)}, r"cameras\.K: expected shape \(2, 3, 3\)"),
         (lambda c: {"frames": c.frames + 1}, "frames: expected 0 to 0"),
-        (lambda c: {"images": c.images * np.nan}, "images: expected numbers in"),
+        (lambda c: {"images": np.where(c.images == c.images[0, 3, 4, 1], np.nan, c.images)}, r"images: .*\[0, 3, 4, 1\]: nan"),
         (lambda c: {"images": c.images * 255}, "images: expected numbers in"),
         (lambda c: {"betas": np.full(3, np.inf, np.float32)}, "betas: expected finite numbers"),
         (lambda c: {"body": replace(c.body, template=np.nan * c.body.template)}, r"body\.template: expected finite"),
@@ -328,7 +314,7 @@ def test_no_photos_and_more_than_the_limit_are_an_error(body, network, views, me
 @pytest.mark.slow
 def test_a_body_that_is_not_finite_is_an_error(body, network):
     photos = capture(replace(body, joint_regressor=body.joint_regressor.at[0, 0].set(np.nan)), SIZE, SIZE)
-    message = "the posed vertices: expected finite numbers.*nan; are the arrays of its body finite"
+    message = "the posed vertices, which all arrays of the body move: expected finite numbers.*nan"
     with pytest.raises(ValueError, match=f"reconstruct: capture: {message}"):
         reconstruct(*network, photos)
     with pytest.raises(ValueError, match=f"reconstruct: captures: {message}"):
@@ -517,7 +503,7 @@ def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
     module = sys.modules[reconstruct_batch.__module__]
     inputs = SimpleNamespace(posed_vertices=None, foreground=None, view_count=None)
     monkeypatch.setattr(module, "_prepare_batch", lambda *_: inputs)
-    monkeypatch.setattr(module, "_check_posed", lambda *_: None)
+    monkeypatch.setattr(module, "check_values", lambda *_: None)
     monkeypatch.setattr(module, "fit_buffers", lambda *of: of[-1])
     photos, config = capture(body, SIZE, SIZE), network[1].with_conventions(light=True)
     turned = with_z_up(photos)
@@ -534,10 +520,3 @@ def test_views_are_padded_to_a_number_not_below_their_own():
     assert np.array_equal(padded.images[:2], views.images) and np.array_equal(padded.rotations[2], views.rotations[1])
     with pytest.raises(ValueError, match="2 views cannot be padded to 1"):
         pad_views(views, 1)
-
-
-def test_the_place_of_a_number_that_is_none_is_named(body, network):
-    photos = capture(body, SIZE, SIZE)
-    photos.images[0, 3, 4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"reconstruct: capture: images: .*\[0, 3, 4, 1\]: nan"):
-        reconstruct(*network, photos)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from humangs_jax.avatar.video import ERROR_COLORS, GAP, contact_sheet, error_colors, side_by_side, tile, write_texts
-from humangs_jax.io.images import read_image, to_uint8, write_png
+from humangs_jax.avatar.video import ERROR_COLORS, GAP, error_colors, side_by_side, tile
+from humangs_jax.io.images import read_image, to_uint8
 
 LEVEL = 0.5 / 255 + 1e-6
 
@@ -40,11 +40,8 @@ def test_texts_are_written_beside_the_images_and_cut_to_their_width():
     assert (sheet[found[0][0] + 40 : found[2][0], :50] == 1).all()  # an empty label leaves white
 
 
-def test_texts_change_only_the_pixels_they_cover():
-    sheet = np.full((20, 60, 3), 0.1234567)
-    written = write_texts(sheet, [("hi", 2, 2, 50)], 12)
-    changed = (written != sheet).any(-1)
-    assert 10 < changed.sum() < 200 and not changed[:, 30:].any()
+def test_colors_are_rounded_to_the_nearest():
+    assert list(to_uint8(np.array([-1.0, 0, 0.4999 / 255, 0.5001 / 255, 1, 7, np.nan]))) == [0, 0, 0, 1, 255, 255, 0]
 
 
 def test_error_colors_are_ordered_and_saturate():
@@ -52,8 +49,6 @@ def test_error_colors_are_ordered_and_saturate():
     np.testing.assert_allclose(colors[[0, 25, 50, 75, 100]], ERROR_COLORS, atol=1e-12)
     assert (np.diff(colors @ [0.299, 0.587, 0.114]) < 0).all()  # darker and darker
     np.testing.assert_array_equal(error_colors(np.array([3.0]), 0.5)[0], ERROR_COLORS[-1])
-    with pytest.raises(ValueError, match="positive"):
-        error_colors(np.zeros(3), 0.0)
 
 
 @pytest.mark.parametrize("count", [1, 5])
@@ -69,27 +64,3 @@ def test_side_by_side_shows_truth_ours_and_error(tmp_path, count):
     np.testing.assert_allclose(tiles[1], ours[0], atol=LEVEL)
     assert (tiles[2][20:] == 1).all() and (tiles[2][:20].mean() < 0.7)
     assert len(np.unique(sheet[-10], axis=0)) > 20  # the scale
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (dict(images=np.zeros((0, 4, 4, 3))), "images"),
-        (dict(images=np.zeros((2, 4, 4, 3)), labels=["a"]), "labels: expected 2"),
-        (dict(images=np.zeros((2, 4, 4, 3)), headers=["a"], columns=2), "headers: expected 2"),
-        (dict(images=np.zeros((2, 4, 4, 3)), columns=0), "columns"),
-    ],
-)
-def test_wrong_numbers_of_things_write_nothing(tmp_path, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        contact_sheet(path=tmp_path / "a.png", **arguments)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_png_round_trip_rounds_to_nearest(tmp_path):
-    image = images(1)[0]
-    write_png(tmp_path / "a.png", image)
-    np.testing.assert_allclose(read_image(tmp_path / "a.png")[0], image, atol=LEVEL)
-    assert list(to_uint8(np.array([-1.0, 0, 0.4999 / 255, 0.5001 / 255, 1, 7, np.nan]))) == [0, 0, 0, 1, 255, 255, 0]
-    with pytest.raises(OSError):
-        write_png(tmp_path / "nowhere" / "a.png", image)

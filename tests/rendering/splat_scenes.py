@@ -7,6 +7,7 @@ import numpy as np
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.tiling import TileGrid
 
 WIDTH, HEIGHT = 21, 13
 COUNT = 32
@@ -45,6 +46,12 @@ def camera(dtype=np.float64, width=WIDTH, height=HEIGHT) -> Camera:
     pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     pose[:3, 3] = [0.05, -0.02, 0.1]
     return Camera(K, jnp.asarray(pose, dtype), width, height)
+
+
+def tile_centers(grid: TileGrid) -> np.ndarray:
+    """(t, 2): x and y of the tiles' centres, pixels."""
+    rows, columns = np.divmod(np.arange(grid.tiles), grid.columns)
+    return (np.stack([columns, rows], axis=-1) + 0.5) * grid.tile_size
 
 
 def few(gaussians: Gaussians, indices: np.ndarray) -> Gaussians:

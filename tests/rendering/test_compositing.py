@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from splat_scenes import tile_centers
 
 from humangs_jax.rendering.compositing import composite
 from humangs_jax.rendering.splat_config import SplatConfig
@@ -37,7 +38,7 @@ def make(seed):
 
 def formula(splats, lists):
     """Tile by tile, splat by splat."""
-    offsets, centers = GRID.offsets(np.float64), GRID.centers(np.float64)
+    offsets, centers = GRID.offsets(np.float64), tile_centers(GRID)
     features, transmittances = [], []
     for tile, (start, count) in enumerate(zip(np.asarray(lists.starts), np.asarray(lists.counts), strict=True)):
         pixels = centers[tile][:, None] + offsets

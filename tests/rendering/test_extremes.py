@@ -12,7 +12,6 @@ from numpy_splatter import splat
 from rounding import bound
 
 from experiments import splatting_numerics as cases
-from experiments.harness import call
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.splatting import SplatConfig, render
 
@@ -133,22 +132,3 @@ def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
         images.append(render(gaussians, Camera(K, pose, scene.width, scene.height), SMALL, background).rgb)
     np.testing.assert_array_equal(*images)
     assert images[0].dtype == np.float32
-
-
-@pytest.mark.parametrize("status", [0, 1])
-def test_the_experiment_shows_its_table_and_fails_on_a_bound(monkeypatch, capsys, status):
-    case = cases.CASES["opacity: 0"]
-    outcome = cases.Outcome(True, 2 * case.image if status else 0.0, 0.0, 0.0, "K", 0.0, 0)
-    exact = cases.dataclasses.replace(outcome, image=0.0)
-    monkeypatch.setattr(cases, "measure", lambda case, in_float64=False: exact if in_float64 else outcome)
-    assert call(cases.splatting_numerics, ["--only", "opacity: 0"]) == status
-    text = capsys.readouterr().out
-    assert "opacity: 0" in text and ("FAILED" in text) == (status == 1)
-
-
-def test_coincident_depths_keep_the_order_of_their_indices():
-    scene, reverse = (cases.coincident(r) for r in (False, True))
-    image, other = (cases.tiled(s)[0].rgb for s in (scene, reverse))
-    assert np.abs(image - other).max() > 0.1  # the order is visible
-    assert np.ptp(scene.gaussians.means[:, 2]) == 0
-    np.testing.assert_allclose(image, cases.reference_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)

@@ -11,7 +11,6 @@ from splat_scenes import camera, random_gaussians, with_harmonics
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.geometry.camera import stack_cameras
 from humangs_jax.rendering import gaussians as harmonics
 from humangs_jax.rendering import reference
 from humangs_jax.rendering.gaussians import constrain, skin_gaussians, unconstrain
@@ -107,16 +106,6 @@ def test_gradients_in_float32_are_those_of_the_reference_in_float64():
         assert np.linalg.norm(a - b) < FLOAT32 * np.linalg.norm(b), name
     pose = np.asarray(got[1], np.float64) - np.asarray(expected[1])
     assert np.linalg.norm(pose) < FLOAT32 * np.linalg.norm(expected[1])
-
-
-def test_a_batch_of_cameras_equals_the_loop():
-    gaussians = with_harmonics(random_gaussians(2, np.float32), 8)
-    first = camera(np.float32)
-    second = replace(first, cam_from_world=first.cam_from_world.at[:3, 3].add(jnp.asarray([0.3, 0.1, 0.0])))
-    draw = jax.jit(lambda g, c: render(g, c, CONFIG).rgb)
-    together = jax.jit(jax.vmap(draw, in_axes=(None, 0)))(gaussians, stack_cameras([first, second]))
-    for image, view in zip(together, (first, second), strict=True):
-        np.testing.assert_allclose(image, draw(gaussians, view), atol=2e-6)
 
 
 def test_parameters_carry_them_and_other_counts_are_refused():

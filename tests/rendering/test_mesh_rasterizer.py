@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rounding import UNIT
 
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig, interpolate_attributes, rasterize_mesh, sample_texture
@@ -284,19 +283,6 @@ def test_faces_without_area_cover_nothing():
     assert (ids == -1).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("scale", [1e-6, 1e4])  # as far as the range of `near` allows
-def test_units_do_not_matter(scale):
-    vertices, faces = sphere()
-    camera = some_camera(1)
-    one = draw(vertices, faces, camera)
-    config = RasterConfig(near=0.01 * scale, rows_per_step=64, fragments_per_step=128)
-    other = draw(vertices * np.float32(scale), faces, camera.in_units(1 / scale), config)
-    assert (np.asarray(one.face_ids) == other.face_ids).mean() > 0.99  # a pixel on an edge may go to the neighbour
-    same = (np.asarray(one.face_ids) == other.face_ids) & (np.asarray(one.face_ids) >= 0)
-    np.testing.assert_allclose(np.asarray(other.depth)[same] / scale, np.asarray(one.depth)[same], rtol=1e-4)
-
-
 def test_huge_faces_cover_everything():
     vertices = np.float32([[-1e5, -1e5, 1], [3e5, -1e5, 1], [-1e5, 3e5, 1]])
     fragments = draw(vertices, np.array([[0, 1, 2]]), flat_camera())
@@ -397,11 +383,6 @@ def test_lookup_equals_loop(seed):
     np.testing.assert_allclose(sample_texture(jnp.asarray(texture), jnp.asarray(uv)), expected, atol=TEXEL_ROUNDING)
 
 
-def test_a_texture_of_one_texel():
-    image = sample_texture(jnp.full((1, 1, 3), 0.25), jnp.asarray([[[0.2, 0.7], [-3.0, 9.0]]]))
-    np.testing.assert_array_equal(image, 0.25)
-
-
 def test_gradient_is_the_weights_of_the_texels():
     texture, uv = jnp.zeros((4, 4, 1)), jnp.asarray([[[0.5, 0.5], [0.0, 0.0]]])
     gradient = jax.grad(lambda t: sample_texture(t, uv).sum())(texture)[..., 0]
@@ -409,35 +390,3 @@ def test_gradient_is_the_weights_of_the_texels():
     expected[1:3, 1:3] = 0.25
     expected[3, 0] = 1
     np.testing.assert_allclose(gradient, expected, atol=TEXEL_ROUNDING)
-
-
-def test_both_windings_are_drawn_alike():
-    camera = flat_camera()
-    front, back = draw(SQUARE, SQUARE_FACES, camera), draw(SQUARE, SQUARE_FACES[:, ::-1], camera)
-    np.testing.assert_array_equal(front.face_ids, back.face_ids)
-    np.testing.assert_allclose(front.barycentrics, back.barycentrics[..., ::-1], atol=4 * UNIT)  # of numbers below 1
-
-
-def test_tiny_faces_between_pixel_centers_are_not_seen():
-    vertices = np.float32([[7.6, 7.6, 1], [8.4, 7.7, 1], [7.7, 8.4, 1]])
-    assert (np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids) == -1).all()
-    vertices = np.float32([[7.4999, 7.4999, 1], [7.5003, 7.4999, 1], [7.4999, 7.5003, 1]])
-    ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
-    assert np.argwhere(ids == 0).tolist() == [[7, 7]]
-
-
-UPPER_LEFT, LOWER_RIGHT = (0.0, 1.0), (1.0, 0.0)
-
-
-def test_corners_of_the_texture():
-    texture = jnp.arange(12.0).reshape(3, 4, 1)
-    uv = jnp.asarray([[UPPER_LEFT, LOWER_RIGHT, (0.0, 0.0), (1.0, 1.0)]])
-    np.testing.assert_array_equal(sample_texture(texture, uv)[0, :, 0], [0, 11, 8, 3])
-
-
-def test_textures_in_float64():
-    with jax.enable_x64(True):
-        texture, uv = np.random.default_rng(0).uniform(size=(3, 5, 2)), np.random.default_rng(1).uniform(size=(1, 2, 2))
-        image = sample_texture(jnp.asarray(texture), jnp.asarray(uv))
-        assert image.dtype == jnp.float64
-        np.testing.assert_allclose(image[0], [lookup(texture, *point) for point in uv[0]], atol=1e-14)

@@ -43,13 +43,6 @@ def test_visibility_is_the_largest_weight():
         assert empty.visibility is not None and empty.visibility.shape == (0,)
 
 
-@pytest.mark.slow
-def test_visibility_passes_no_gradient():
-    gaussians, config = random_gaussians(3, np.float32), knobs(visibility=True)
-    gradient = jax.grad(lambda g: jnp.sum(render(g, camera(np.float32), config).visibility))(gaussians)
-    assert all((leaf == 0).all() for leaf in jax.tree.leaves(gradient))
-
-
 def wall_before(gaussians):
     """An opaque wall, in three layers, between one camera and the Gaussians; another camera looks past it."""
     n = 3
@@ -102,18 +95,6 @@ def test_presets_draw_nearly_the_same(name, most):
     exact, ours = (render(gaussians, view, SPLAT_PRESETS[preset]) for preset in ("exact", name))
     assert SPLAT_PRESETS["exact"] == SplatConfig()
     assert 0 < np.abs(ours.rgb - exact.rgb).mean() < most
-
-
-@pytest.mark.slow
-def test_one_plan_serves_an_animation():
-    gaussians, view = random_gaussians(10, np.float32), camera(np.float32)
-    drawn = jax.jit(lambda *arguments: render(*arguments), static_argnums=2)  # with a cache of its own
-    config = plan_buffers(gaussians, view, SMALL)
-    for step in range(4):
-        moved = replace(gaussians, means=gaussians.means + 0.02 * step)
-        assert plan_buffers(moved, view, SMALL) == config
-        assert drawn(moved, view, config).overflow == 0
-    assert drawn._cache_size() == 1
 
 
 def test_settings_are_checked():

@@ -18,9 +18,8 @@ from humangs_jax.avatar.frames import render_in_bands
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.rendering.buffers import default_pairs, plan_buffers
-from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.reference import render_reference
-from humangs_jax.rendering.splatting import SplatConfig, draw_projected, render, render_views
+from humangs_jax.rendering.splatting import SplatConfig, render, render_views
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
@@ -123,32 +122,6 @@ def test_an_image_in_bands_is_the_image(most):
         np.testing.assert_allclose(got, expected, atol=FLOAT32)
 
 
-def test_gradients_are_derivatives():
-    """Central differences, with decisions that do not flip at this seed and no alpha at the clamp."""
-    with jax.enable_x64(True):
-        gaussians, step = random_gaussians(11), 1e-6
-        gaussians = replace(gaussians, opacities=gaussians.opacities.at[:15].multiply(0.9))
-        arguments = gaussians, camera(), background()
-        gradients = tiled(*arguments)[1]
-        rng = np.random.default_rng(3)
-        weights = loss_weights()
-
-        def loss(arguments):
-            r = tiled(*arguments)[0]
-            return sum(float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
-
-        leaves, structure = jax.tree.flatten(arguments)
-        slopes = jax.tree.leaves(gradients)
-        assert [a.shape for a in leaves] == [a.shape for a in slopes]
-        for i, slope in enumerate(slopes):
-            direction = jnp.asarray(rng.normal(size=slope.shape))
-            moved = [
-                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]]) for s in (step, -step)
-            ]
-            difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
-            np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)], ids=["default", "tile 5"])
 def test_the_schedule_does_not_change_the_image(config):
@@ -181,16 +154,6 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
     assert error.max() < 2 / 255
     assert_close(ours[1], jax.tree.map(np.asarray, expected[1]), FLOAT32_GRADIENT)
     assert ours[0].rgb.dtype == np.float32
-
-
-def test_the_order_of_the_gaussians_does_not_matter():
-    with jax.enable_x64(True):
-        gaussians = random_gaussians(9)
-        order = np.random.default_rng(0).permutation(COUNT)
-        image, (gradient, *_) = tiled(gaussians, camera(), background())
-        other_image, (other, *_) = tiled(few(gaussians, order), camera(), background())
-        assert_close(other_image, image, FLOAT64)
-        assert_close(other, few(gradient, order), FLOAT64)
 
 
 def test_coincident_depths_are_drawn_by_index():
@@ -297,16 +260,3 @@ def test_lowers_for_every_platform(gradient, functions):
     function = jax.grad(loss) if gradient else lambda gaussians, view: render(gaussians, view, CHUNKS).rgb
     exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)
     assert "callback" not in exported.mlir_module()
-
-
-@pytest.mark.slow
-def test_the_two_halves_are_the_whole():
-    gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
-
-    @jax.jit
-    def halves(gaussians, view):
-        projected = project_gaussians(gaussians, view, CHUNKS)
-        return draw_projected(projected, gaussians, view, CHUNKS, background(np.float32))
-
-    whole = jax.jit(lambda g, c: render(g, c, CHUNKS, background(np.float32)))(gaussians, view)
-    assert_close(halves(gaussians, view), whole, FLOAT32)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians
+from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians, tile_centers
 
 from humangs_jax.rendering import tiling
 from humangs_jax.rendering.projection import project_gaussians as project
@@ -42,11 +42,6 @@ def test_expand_equals_repeat(counts, capacity):
     np.testing.assert_array_equal(expansion.source[: len(expected)], expected)
     np.testing.assert_array_equal(expansion.first, np.cumsum(counts) - counts)
     assert expansion.needed == counts.sum()  # exact, whatever the capacity
-
-
-def test_expand_of_nothing():
-    assert tiling.expand(jnp.zeros(0, jnp.int32), 4).needed == 0
-    assert tiling.expand(jnp.zeros(3, jnp.int32), 4).needed == 0
 
 
 @pytest.mark.parametrize("item_count", [50, 1 << 30])  # packed into one uint32; two keys
@@ -86,18 +81,10 @@ def test_blocks_come_by_falling_length_and_skip_empty_tiles(counts, block):
 
 
 @pytest.mark.parametrize(("width", "height", "tile_size"), [(16, 8, 8), (13, 21, 8), (1, 1, 8), (5, 3, 1), (7, 30, 16)])
-def test_image_and_tiles_are_inverse_for_any_size(width, height, tile_size):
+def test_pixel_positions_are_those_of_the_image(width, height, tile_size):
     grid = TileGrid(width, height, tile_size)
-    image = jnp.asarray(np.random.default_rng(0).normal(size=(height, width, 3)), jnp.float32)
-    tiles = tiling.image_to_tiles(image, grid)
-    assert tiles.shape == (grid.tiles, 3, grid.pixels)
-    np.testing.assert_array_equal(tiling.tiles_to_image(tiles, grid), image)
-
-
-def test_pixel_positions_are_those_of_the_image():
-    grid = TileGrid(13, 21, 8)
-    y, x = np.mgrid[:21, :13] + 0.5
-    tiles = grid.centers()[:, :, None] + grid.offsets()
+    y, x = np.mgrid[:height, :width] + 0.5
+    tiles = tile_centers(grid)[:, :, None] + grid.offsets()
     np.testing.assert_array_equal(tiling.tiles_to_image(jnp.asarray(tiles), grid), np.stack([x, y], axis=-1))
 
 

@@ -67,7 +67,7 @@ def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
         np.testing.assert_allclose(rgb, expected, atol=bound(FLOAT32))
 
 
-AGAINST_FOG = {"absolute": 0.2, "boundary": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003, "shells": 3.0}
+AGAINST_FOG = {"absolute": 0.2, "boundary": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003}
 
 
 @pytest.mark.slow

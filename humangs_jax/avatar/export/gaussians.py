@@ -66,9 +66,7 @@ def turned(gaussians: Gaussians, up: Up) -> Gaussians:
 
 def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
     """Gaussians turned about the origin by a quaternion (wxyz) of quarters of a turn."""
-    if gaussians.deformations is not None:
-        gaussians = factored(gaussians)
-    matrix = jnp.asarray(_matrix(turn), gaussians.means.dtype)
+    gaussians, matrix = factored(gaussians), jnp.asarray(_matrix(turn), gaussians.means.dtype)
     means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
     quats = quaternion.multiply(jnp.asarray(turn, gaussians.quats.dtype), gaussians.quats)
     harmonics = gaussians.harmonics
@@ -92,16 +90,7 @@ def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, means=gaussians.means - shift)
 
 
-def plain_arrays(
-    gaussians: Gaussians,
-) -> tuple[
-    Float[np.ndarray, "g 3"],
-    Float[np.ndarray, "g 4"],
-    Float[np.ndarray, "g 3"],
-    Float[np.ndarray, " g"],
-    Float[np.ndarray, "g 3"],
-    Float[np.ndarray, "g k 3"],
-]:
+def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     """Means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for none) in float64, without deformations
     and without low-pass.
 
@@ -111,13 +100,9 @@ def plain_arrays(
     Raises: ValueError for numbers that files cannot hold: not finite, or of more than `checks.LARGEST`.
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
-    bounded = {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names}
     check_values("export", gaussian_values(gaussians))
-    check_values("export", bounded)
-    gaussians = replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)
-    if gaussians.deformations is not None:
-        gaussians = factored(gaussians)
-    g = gaussians
+    check_values("export", {f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in names})
+    g = factored(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None))
     harmonics = np.zeros((len(g.means), 0, 3)) if g.harmonics is None else g.harmonics
     arrays = (g.means, g.quats, g.scales, g.opacities, g.colors, harmonics)
     means, quats, scales, opacities, colors, harmonics = (np.asarray(x, np.float64) for x in arrays)

@@ -275,12 +275,8 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
     return material
 
 
-def write_obj(path: Path, mesh: BodyMesh, material: Path | None = None, up: Up = "y") -> None:
-    """Write a mesh; the file appears whole or not at all.
-
-    Arguments: material: what `write_material` wrote beside it; None writes it. up: the axis that points up in the file.
-    """
-    material = write_material(path, mesh) if material is None else material
+def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
+    """Write a mesh. material: what `write_material` wrote beside it. up: the axis that points up in the file."""
     turn = up_matrix(up)
     rows = lambda key, values: [f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()]
     corners = [" ".join(f"{i}/{i}/{i}" for i in face) for face in (mesh.faces + 1).tolist()]
