@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +47,10 @@ def checked_json(file: Path, text: str | None = None, missing: str = "no such fi
         return parse_json(checked_text(file, missing) if text is None else text)
 
 
-def check_place(folder: Path, overwrite: bool) -> None:
-    """Whether a capture may be written to a folder: a new or an empty one, or with `overwrite` another capture."""
+def check_place(folder: Path, overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:
+    """Whether a capture may be written to a folder, see `io.atomic.check_replaceable`."""
     try:
-        check_replaceable(folder, overwrite, "capture.json")
+        check_replaceable(folder, overwrite, "capture.json", inputs)
     except ValueError as error:
         raise CaptureError("", "", error) from error
 
@@ -84,6 +84,11 @@ def few(names: Sequence[str], most: int = 4) -> str:
     """Names for an error or a warning; beyond so many they are counted."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def counted(number: int, noun: str) -> str:
+    """As in "1 photo" and "2 photos"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 # Numbers -------------------------------------------------------------------------------------------------------------

@@ -117,10 +117,8 @@ def test_whole_or_not_at_all(rig):
 
 
 def test_overwriting_spares_what_is_no_capture_and_the_sources(rig, tmp_path):
-    with pytest.raises(CaptureError, match="no capture"):
-        import_cameras(rig[0], rig[1], rig[1], overwrite=True)
     import_rig(rig)
-    with pytest.raises(CaptureError, match="would be overwritten"):
+    with pytest.raises(CaptureError, match="lies in it and would be deleted"):
         import_cameras(rig[0], rig[2] / "images", rig[2], overwrite=True)
     with pytest.raises(CaptureError, match="is a file"):
         import_cameras(rig[0], rig[1], rig[0])
@@ -426,7 +424,7 @@ def test_masks_that_a_transforms_json_names_are_used(tmp_path, key):
     assert warning == f"{key} of transforms.json: no such mask, ./fg/a.png: imported without masks"
     masks = write_masks(tmp_path / "fg", [PERSON] * 4)
     report = import_cameras(*source, up="+y", overwrite=True)
-    assert report.masks and report.warnings == () and f"masks: those that transforms.json names ({key})" in str(report)
+    assert report.masks and report.warnings == () and f"masks: those of {key} of transforms.json" in str(report)
     assert [view["mask"] for view in views_of(tmp_path / "out")] == [f"masks/{file}" for file in FILES]
     report = import_cameras(*source, masks=masks, up="+y", overwrite=True)
     assert report.warnings == (f"{key} of transforms.json: not used, the masks are those in {masks}",)
@@ -441,7 +439,7 @@ def test_masks_named_for_some_or_outside_are_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"images/b\.png: mask_path: missing, but other images have one"):
         import_cameras(*source)
     source = named_masks(tmp_path, "mask_path", [7, None, None, None])
-    with pytest.raises(CaptureError, match=r"frames\[0\]\.mask_path: expected the path of a mask, got 7"):
+    with pytest.raises(CaptureError, match=r"frames\[0\]\.mask_path: expected a name or path, got 7"):
         import_cameras(*source)
     (tmp_path / "inner").mkdir()
     for name in ("images", "transforms.json"):

@@ -163,21 +163,17 @@ def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel
     """
     turn = np.asarray(ROTATION_TO_Y_UP[up], float)
     shift = 0.5 if pixel_centers == "integer" else 0.0
-    observations = calibration.observations
-    if observations is not None:
-        observations = dataclasses.replace(
-            observations, points=scale * observations.points @ turn.T, pixels=observations.pixels + shift
-        )
-    cameras = tuple(_convert(camera, scale, turn, shift) for camera in calibration.cameras)
-    return dataclasses.replace(calibration, cameras=cameras, observations=observations, up="+y", pixel_centers="half")
-
-
-def _convert(camera: CalibratedCamera, scale: float | int, turn: Float[np.ndarray, "3 3"], shift: float) -> CalibratedCamera:
-    K, pose = camera.K.copy(), camera.cam_from_world.copy()
-    K[:2, 2] += shift
-    pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
-    pose[:3, 3] *= scale
-    return dataclasses.replace(camera, K=K, cam_from_world=pose)
+    seen = calibration.observations
+    if seen is not None:
+        seen = dataclasses.replace(seen, points=scale * seen.points @ turn.T, pixels=seen.pixels + shift)
+    cameras = []
+    for camera in calibration.cameras:
+        K, pose = camera.K.copy(), camera.cam_from_world.copy()
+        K[:2, 2] += shift
+        pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
+        pose[:3, 3] *= scale
+        cameras.append(dataclasses.replace(camera, K=K, cam_from_world=pose))
+    return dataclasses.replace(calibration, cameras=tuple(cameras), observations=seen, up="+y", pixel_centers="half")
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -287,19 +283,14 @@ def undistort_person(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """A photo on white and its mask without distortion: `undistort`, in the box around the person alone, which is faster."""
     step = 16
-    corners = [np.arange(0.0, size + step, step) for size in mask.shape]
-    grid = np.stack(np.meshgrid(*corners[::-1]), axis=-1)
-    on_person = [np.flatnonzero(mask.max(axis=axis) > 0) for axis in (0, 1)]
-    nobody = np.ones_like(image), np.zeros_like(mask)
-    if not len(on_person[0]):
-        return nobody
-    low, high = ([each[i] - step for each in on_person] for i in (0, -1))  # a cell more than the person on every side
-    source = _in_photo(grid, K, coefficients)
-    near = ((source > low) & (source < np.add(high, 2 * step))).all(axis=-1)
-    if not near.any():
-        return nobody
-    slices = [np.flatnonzero(np.logical_or.reduce(near, axis=axis)) * step for axis in (1, 0)]
-    box = tuple(slice(max(0, each[0] - step), each[-1] + step) for each in slices)
+    rows, columns = (np.arange(0.0, size + step, step) for size in mask.shape)
+    source = _in_photo(np.stack(np.meshgrid(columns, rows), axis=-1), K, coefficients)
+    person = np.argwhere(mask > 0)[:, ::-1]
+    # a cell more than the person on every side
+    near = [((source > person.min(0) - step) & (source < person.max(0) + step)).all(axis=-1)] if len(person) else []
+    if not np.any(near):
+        return np.ones_like(image), np.zeros_like(mask)
+    box = [slice(max(0, each.min() - 1) * step, (each.max() + 1) * step) for each in np.nonzero(near[0])]
     both = undistort(np.dstack([1 - image, mask]), K, coefficients, 0.0, (box[0], box[1]))
     return 1 - both[..., :3], both[..., 3]
 

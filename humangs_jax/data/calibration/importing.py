@@ -5,7 +5,6 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
 import dataclasses
-import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
@@ -42,10 +41,10 @@ from humangs_jax.data.calibration.photos import (
     turned_cameras,
 )
 from humangs_jax.data.calibration.videos import photos_of_videos
-from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, few
+from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, counted, few
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
+from humangs_jax.io.images import is_heic, oriented, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading
 
 SIZES_SHOWN = 5
@@ -87,18 +86,17 @@ class ImportReport:
         return self.checks.warnings
 
     def __str__(self) -> str:
-        count = lambda n, noun: f"{n} {noun}{'' if n == 1 else 's'}"
-        photos, frames, cameras = count(self.views, "photo"), count(self.frames, "frame"), count(self.cameras, "camera")
+        photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
         centers = "whole numbers (0.5 added to cx and cy)" if self.pixel_centers == "integer" else "+0.5"
         lines = [
-            f"{self.out}: {photos} of {self.width} x {self.height} pixels: {cameras}, {frames}",
+            f"{self.out}: {photos} of {self.width} x {self.height} pixels: {cameras}, {counted(self.frames, 'frame')}",
             f"read as: {self.format} ({self.source}): {self.convention}; {self.up} up; "
             f"{self.scale:g} m per unit; pixel centres at {centers}",
         ]
         if self.undistorted:
-            lines.append(f"lens distortion removed from {count(self.undistorted, 'photo')}")
+            lines.append(f"lens distortion removed from {counted(self.undistorted, 'photo')}")
         if self.checks.reprojection is not None:
-            error, points = self.checks.reprojection, count(self.checks.observations, "observation")
+            error, points = self.checks.reprojection, counted(self.checks.observations, "observation")
             lines.append(f"mean reprojection error: {error:.3g} px ({points})")
         if self.checks.distance is not None:
             lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
@@ -136,7 +134,10 @@ def import_cameras(
     masks = None if masks is None else Path(masks)
     scale = 1.0 if scale is None else scale
     _check_options(scale, up, pixel_centers, every, frames)
-    _check_folders(source, images, masks, out, overwrite)
+    for folder in (images, masks):
+        if folder is not None and not folder.is_dir():
+            raise CaptureError(folder, "", "no such folder")
+    check_place(out, overwrite, (source, images, masks))
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
         calibration = read_calibration(source, lambda name: photo_size(photo_of(images, name, source)))
         return import_calibration(calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers)
@@ -165,23 +166,29 @@ def import_calibration(
         checked_camera(camera.K, camera.cam_from_world, camera.width, camera.height, calibration.file, camera.name)
     checks = check_calibration(calibration, converted, up)
     frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
-    notes, about_turns = turn_notes(photos, turns)
+    notes, warnings = turn_notes(photos, turns)
     if heic := sum(map(_of_phones, photos)):
-        notes = (*notes, f"written as PNG: {heic} HEIC photo{'' if heic == 1 else 's'}")
-    notes = (*notes, *_padding_notes(turns, canvas))
-    named, unused = _named_masks(calibration, photos, masks)
-    more = [*about_turns, *about_masks, *([unused] if unused else ())]
+        notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
+    notes += _padding_notes(turns, canvas)
+    warnings += about_masks
+    if calibration.mask_key is not None:
+        named = f"{calibration.mask_key} of {calibration.file.name}"
+        if masks is not None:
+            warnings.append(f"{named}: not used, the masks are those in {masks}")
+        elif photos[0].mask is not None:
+            notes.append(f"masks: those of {named}")
+        else:
+            first = next(camera.mask for camera in calibration.cameras if camera.mask)
+            warnings.append(f"{named}: no such mask, {first}: imported without masks")
     if cameras > 1 and frames == len(photos) > 1:
-        more.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
-    checks = dataclasses.replace(checks, warnings=(*checks.warnings, *more))
+        warnings.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
     cut: list[str] = []
     write = lambda folder: cut.extend(_write(folder, converted, photos, turns, names, canvas))
     replace_folder(out, write, mark="capture.json")
     if cut:
-        padded = f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background"
-        checks = dataclasses.replace(checks, warnings=(*checks.warnings, padded))
+        warnings.append(f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background")
     return ImportReport(
         out=out,
         format=calibration.format,
@@ -196,25 +203,12 @@ def import_calibration(
         pixel_centers=pixel_centers,
         convention=calibration.convention,
         undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
-        checks=checks,
-        notes=(*notes, named) if named else notes,
+        checks=dataclasses.replace(checks, warnings=(*checks.warnings, *warnings)),
+        notes=tuple(notes),
         masks=photos[0].mask is not None,
         turned=sum(turn.rewrites for turn in turns),
         heic=heic,
     )
-
-
-def _named_masks(calibration: Calibration, photos: Sequence[Photo], masks: Path | None) -> tuple[str | None, str | None]:
-    """A note about masks that the calibration names, and a warning about those that the capture does not get."""
-    if calibration.mask_key is None:
-        return None, None
-    named = f"{calibration.mask_key} of {calibration.file.name}"
-    if masks is not None:
-        return None, f"{named}: not used, the masks are those in {masks}"
-    if photos[0].mask is not None:
-        return f"masks: those that {calibration.file.name} names ({calibration.mask_key})", None
-    first = next(camera.mask for camera in calibration.cameras if camera.mask)
-    return None, f"{named}: no such mask, {first}: imported without masks"
 
 
 def _check_options(scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
@@ -226,17 +220,6 @@ def _check_options(scale: float | int, up: str | None, pixel_centers: str | None
     for name, value in (("every", every), ("frames", frames)):
         if value is not None and value < 1:
             raise ArgumentError(name, f"{value}: expected at least 1")
-
-
-def _check_folders(source: Path, images: Path, masks: Path | None, out: Path, overwrite: bool) -> None:
-    for folder in (images, masks):
-        if folder is not None and not folder.is_dir():
-            raise CaptureError(folder, "", "no such folder")
-    check_place(out, overwrite)
-    inside = lambda path: Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out))  # resolve() raises for loops
-    for path in (source, images, masks):
-        if path is not None and inside(path):
-            raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
 
 
 def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
@@ -264,16 +247,16 @@ def _by(width: int, height: int) -> str:
     return f"{width} x {height}"
 
 
-def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> tuple[str, ...]:
+def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> list[str]:
     counts = Counter(turn.size for turn in turns)
     if set(counts) == {canvas}:
-        return ()
+        return []
     sizes = ", ".join(f"{count} of {_by(*size)}" for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN])
     more = ", ..." if len(counts) > SIZES_SHOWN else ""
-    return (
+    return [
         f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so that all have "
-        f"{_by(*canvas)}; pixels keep their places: keypoints of the upright photos still fit",
-    )
+        f"{_by(*canvas)}; pixels keep their places: keypoints of the upright photos still fit"
+    ]
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
@@ -334,8 +317,8 @@ def _rewrite(
     Returns: the paths for capture.json, and whether the person reaches a rim where the photo is padded.
     """
     image, alpha = read_checked(read_image, photo.image)
-    image, alpha = turn.image(image), turn.image(alpha) if transparent and alpha is not None else None
-    mask = alpha if photo.mask is None else turn.of_mask(read_checked(read_grey, photo.mask))
+    image, alpha = oriented(image, turn.photo), oriented(alpha, turn.photo) if transparent and alpha is not None else None
+    mask = alpha if photo.mask is None else oriented(read_checked(read_grey, photo.mask), turn.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
         mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))

@@ -2,7 +2,7 @@
 
 Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it. What an import writes has none:
 pixels are turned upright, and with them the camera, if it was calibrated for the pixels as stored (COLMAP). A calibration of the
-turned photo (OpenCV) is told by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
+turned photo (OpenCV) is told by its size. No camera sees a mirrored photo.
 """
 
 import dataclasses
@@ -12,12 +12,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
-from humangs_jax.data.capture_checks import CaptureError, few
+from humangs_jax.data.capture_checks import CaptureError, counted, few
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
+from humangs_jax.io.images import image_size, open_image, orientation, read_image
 from humangs_jax.io.reading import inside, reading
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
@@ -44,14 +43,19 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
     Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not there, or some of the named ones.
     """
     if calibration.per_image:
-        names = [camera.name for camera in calibration.cameras]
-        found = [(i, calibration.cameras[i].frame, photo) for i, photo in _of_images(images, names, calibration.file)]
-        found.sort(key=lambda entry: (entry[1], entry[0]))
+        owners: dict[Path, str] = {}
+        for camera in calibration.cameras:
+            photo = photo_of(images, camera.name, calibration.file)
+            if photo in owners:
+                problem = f"{photo} is the photo of {owners[photo]} already: expected one for each"
+                raise CaptureError(calibration.file, camera.name, problem)
+            owners[photo] = camera.name
+        found = [(i, calibration.cameras[i].frame, photo) for i, photo in enumerate(owners)]
     else:
         found = _of_cameras(calibration, images)
     named = {} if masks is not None or calibration.mask_key is None else _named_masks(calibration, images)
     photos = []
-    for camera, frame, image in found:
+    for camera, frame, image in sorted(found, key=lambda entry: (entry[1], entry[0])):
         key = image.relative_to(images).with_suffix("").as_posix()
         mask = named.get(camera) if masks is None else _mask_file(masks, images, image)
         photos.append(Photo(image, mask, camera, frame, key))
@@ -75,25 +79,17 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     return found
 
 
-def find_photo(folder: Path, name: str) -> Path | None:
-    """The photo of a path that may lack its suffix, have another one, or begin with folders above `folder`.
-
-    Raises: CaptureError for a link to what is outside of the folder, see `io.reading.inside`.
-    """
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    parts = [part for part in parts if part not in (".", "..", "/")]
-    found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
-    photo = next((photo for photo in found if photo is not None), None)
-    if photo is not None:
-        _check_inside(folder, photo.relative_to(folder))
-    return photo
-
-
 def photo_of(folder: Path, name: str, file: Path) -> Path:
-    """The photo that a file names, see `find_photo`. Raises: CaptureError if there is none."""
-    if (photo := find_photo(folder, name)) is None:
-        raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
-    return photo
+    """The photo that a file names, by a path that may lack its suffix, have another one, or begin with folders above `folder`.
+
+    Raises: CaptureError if there is none, and for a link to what is outside of the folder, see `io.reading.inside`.
+    """
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")]
+    for start in range(len(parts)):
+        if (photo := _any_suffix(folder.joinpath(*parts[start:]))) is not None:
+            _check_inside(folder, photo.relative_to(folder))
+            return photo
+    raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
 
 
 def _check_inside(folder: Path, name: str | Path) -> None:
@@ -117,16 +113,6 @@ def is_photo(path: Path) -> bool:
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, of the file's head alone. Raises: CaptureError if it is no image."""
     return read_checked(image_size, path)
-
-
-def _of_images(images: Path, names: Sequence[str], file: Path) -> list[tuple[int, Path]]:
-    photos: dict[Path, str] = {}
-    for name in names:
-        photo = photo_of(images, name, file)
-        if photo in photos:
-            raise CaptureError(file, name, f"{photo} is the photo of {photos[photo]} already: expected one for each")
-        photos[photo] = name
-    return list(enumerate(photos))
 
 
 def _mask_file(masks: Path, images: Path, image: Path) -> Path:
@@ -160,8 +146,7 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
         if not photos:
             raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
     frames = {frame: i for i, frame in enumerate(_in_order({f for photos in frames_of for f in photos}))}
-    found = [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
-    return sorted(found, key=lambda entry: (entry[1], entry[0]))
+    return [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
 
 
 def _photos_in(folder: Path) -> dict[str, Path]:
@@ -177,25 +162,20 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 # Orientation ----------------------------------------------------------------------------------------------------------
 
-UNMIRRORED = {1: 1, 2: 1, 3: 3, 4: 3, 5: 6, 6: 6, 7: 8, 8: 8}
-"""Flags, and those that turn alike without mirroring."""
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
-"""Clockwise quarter turns that a flag asks for."""
-MIRROR = 2
+"""Clockwise quarter turns that a flag asks for; the other ones mirror."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Turn:
     """How the pixels of a photo and of its mask become what is imported."""
 
-    flag: int
-    """Of the photo."""
     photo: int
-    """The flag to obey."""
-    mask: tuple[int, ...]
-    """Flags to obey, one after the other."""
-    camera: int
-    """The flag by which the camera is turned, 1 for a calibration of the turned photo."""
+    """The flag of the photo."""
+    mask: int
+    """The flag by which the mask is turned."""
+    quarters: int
+    """Of the camera, 0 for a calibration of the turned photo."""
     size: tuple[int, int]
     """Width and height after it."""
     certain: bool = True
@@ -204,31 +184,21 @@ class Turn:
     @property
     def rewrites(self) -> bool:
         """Whether the files cannot be copied as they are."""
-        return self.flag != 1 or any(flag != 1 for flag in self.mask)
-
-    def image(self, pixels: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "height width *c"]:
-        """The photo, or its alpha channel, upright."""
-        return oriented(pixels, self.photo)
-
-    def of_mask(self, pixels: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "height width"]:
-        """The mask, upright."""
-        for flag in self.mask:
-            pixels = oriented(pixels, flag)
-        return pixels
+        return (self.photo, self.mask) != (1, 1)
 
 
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
     """One for each photo.
 
     Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
-    calibrated for pixels as stored, but whose photos have different flags.
+    calibrated for pixels as stored, but whose photos have different flags, or one that mirrors.
     """
     turns = tuple(_find_turn(calibration.cameras[photo.camera], photo, calibration.upright) for photo in photos)
     first: dict[int, tuple[Photo, Turn]] = {}
     for photo, turn in zip(photos, turns, strict=True):
         other, known = first.setdefault(photo.camera, (photo, turn))
-        if known.camera != turn.camera:
-            problem = f"EXIF orientation {turn.flag}, but {other.image.name} of the same camera has {known.flag}"
+        if known.quarters != turn.quarters:
+            problem = f"EXIF orientation {turn.photo}, but {other.image.name} of the same camera has {known.photo}"
             raise CaptureError(photo.image, "", f"{problem}: expected one; turn the photos before calibrating")
     return turns
 
@@ -246,26 +216,22 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
             problem += "; was it turned (an EXIF orientation that got lost)?"
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
     as_stored = calibrated == stored and not upright
-    own = UNMIRRORED[flag] if as_stored else flag
-    size = stored if own < 5 else stored[::-1]
-    mask = () if photo.mask is None else _mask_flags(photo.mask, flag, own, stored, shown)
-    return Turn(flag, own, mask, own if as_stored else 1, size, certain=flag == 1 or stored != shown or upright)
+    if as_stored and flag not in QUARTERS:
+        raise CaptureError(photo.image, "", f"EXIF orientation {flag} mirrors what the camera saw: expected the photo without it")
+    mask = 1 if photo.mask is None else _mask_flag(photo.mask, flag, stored, shown)
+    return Turn(flag, mask, QUARTERS[flag] if as_stored else 0, shown, certain=flag == 1 or stored != shown or upright)
 
 
-def _mask_flags(mask: Path, flag: int, own: int, stored: tuple[int, int], shown: tuple[int, int]) -> tuple[int, ...]:
-    """A mask with a flag, or of the size of the turned photo, shows it as turned; else as stored."""
-    back = (MIRROR,) if own != flag else ()
-    mask_flag, size = read_checked(orientation, mask), photo_size(mask)
-    if mask_flag != 1:
-        size = size if mask_flag < 5 else size[::-1]
-        if size == shown:
-            return mask_flag, *back
-    elif flag == 1 and size == stored:
-        return ()
-    elif size == shown:  # where both sizes are the same: most tools that make masks obey the flag
-        return back
-    elif size == stored:
-        return (own,)
+def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
+    """A mask with a flag, or of the size of the turned photo, shows it as turned; else as stored.
+
+    Where both sizes are the same it is taken to be turned: most tools that make masks obey the flag.
+    """
+    own, size = read_checked(orientation, mask), photo_size(mask)
+    if (size if own < 5 else size[::-1]) == shown:
+        return own
+    if own == 1 and size == stored:
+        return flag
     wanted = " or ".join(f"{width} x {height}" for width, height in dict.fromkeys((shown, stored)))
     raise CaptureError(mask, "size", f"{size[0]} x {size[1]}, but its photo has {wanted}: expected the same")
 
@@ -275,9 +241,9 @@ def turned_cameras(calibration: Calibration, photos: Sequence[Photo], turns: Seq
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
     for i, turn in {photo.camera: turn for photo, turn in zip(photos, turns, strict=True)}.items():
-        width, height = turn.size if QUARTERS[turn.camera] % 2 == 0 else turn.size[::-1]
+        width, height = turn.size if turn.quarters % 2 == 0 else turn.size[::-1]
         camera = dataclasses.replace(cameras[i], width=width, height=height)
-        for _ in range(QUARTERS[turn.camera]):
+        for _ in range(turn.quarters):
             if seen is not None and pixels is not None:
                 own = seen.cameras == i
                 pixels[own] = np.stack([camera.height - pixels[own, 1], pixels[own, 0]], axis=-1)
@@ -309,28 +275,23 @@ def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
     )
 
 
-def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str], list[str]]:
     """What was done, and warnings about what sizes cannot tell; a line each."""
-    flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.flag != 1]
+    flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.photo != 1]
     if not flagged:
-        return (), ()
-    count = f"{len(flagged)} photo{'' if len(flagged) == 1 else 's'}"
+        return [], []
     whole = "the calibration is of the turned photos"
-    stored = [turn for _, turn in flagged if turn.camera != 1 or turn.photo != turn.flag]
-    if stored:
+    if any(turn.quarters for _, turn in flagged):
         whole = "their cameras, too: the calibration is of the pixels as stored"
-    notes, warnings = [f"turned upright by the EXIF orientation: {count} ({whole})"], []
+    notes, warnings = [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"], []
     if unsure := [(photo, turn) for photo, turn in flagged if not turn.certain]:
         which = few([photo.image.name for photo, _ in unsure], 1)
         of_masks = ", the mask to be of the turned photo" if unsure[0][0].mask is not None else ""
         warnings.append(
-            f"EXIF orientation {unsure[0][1].flag} of {which}: the calibration is taken to be of the pixels as stored{of_masks}; "
+            f"EXIF orientation {unsure[0][1].photo} of {which}: the calibration is taken to be of the stored pixels{of_masks}; "
             "their sizes do not tell. If that is wrong, save the photos turned"
         )
-    mirrored = [photo.image.name for photo, turn in flagged if turn.photo != turn.flag]
-    if mirrored:
-        warnings.append(f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so")
-    return tuple(notes), tuple(warnings)
+    return notes, warnings
 
 
 # Masks ----------------------------------------------------------------------------------------------------------------
@@ -359,9 +320,15 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
     found: dict[str, list[str]] = {}
     opaque = True
     for photo in photos:
-        mask = _mask(photo)
+        if photo.mask is None:
+            mask = read_checked(read_image, photo.image)[1]
+        else:
+            mask = read_mask(photo.mask, "its photo", *photo_size(photo.mask))
         opaque = opaque and mask.min() == 1
-        if (problem := _problem(mask > MASK_THRESHOLD)) is not None:
+        person = mask > MASK_THRESHOLD
+        border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
+        problem = EMPTY if not person.any() else FULL if person.all() else INVERTED if border.mean() > AROUND else None
+        if problem is not None:
             found.setdefault(problem, []).append((photo.mask or photo.image).name)
     if not masked and opaque:
         return ()  # many programs write an opaque alpha channel: it says nothing
@@ -369,22 +336,6 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
         first = photos[0].mask or photos[0].image
         raise CaptureError(first, "mask", "empty, as are all of them: expected 255 where the person is")
     return tuple(f"{problem}: {few(names)}" for problem, names in found.items())
-
-
-def _mask(photo: Photo) -> Float[np.ndarray, "h w"]:
-    if photo.mask is None:
-        return read_checked(read_image, photo.image)[1]
-    width, height = read_checked(image_size, photo.mask)
-    return read_mask(photo.mask, "its photo", width, height)
-
-
-def _problem(person: Bool[np.ndarray, "h w"]) -> str | None:
-    if not person.any():
-        return EMPTY
-    if person.all():
-        return FULL
-    border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
-    return INVERTED if border.mean() > AROUND else None
 
 
 def has_alpha(photo: Path) -> bool:

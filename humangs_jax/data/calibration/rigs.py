@@ -13,7 +13,7 @@ import functools
 import re
 import tomllib
 import xml.etree.ElementTree as tree
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +32,16 @@ from humangs_jax.data.calibration.calibration import (
     pose_matrix,
     rotation,
 )
-from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, expect, floats
+from humangs_jax.data.capture_checks import CaptureError, checked_text, expect, floats
 from humangs_jax.data.formats import CameraFormat
-from humangs_jax.io.reading import Refused, check_limit, check_nesting, limits, reading
+from humangs_jax.io.reading import Refused, check_limit, check_nesting, limits, parse_json, reading
 
 FISHEYE = ("fisheye", "is_fisheye", "equidistant")
 """Values of `model` and the like, or keys that are true, of lenses with another formula."""
-SIZE_KEYS = ("imgSize", "image_size")
+
+
+Where = Callable[[str], tuple[Path, str]]
+"""The file and the field of a key of a camera, for errors."""
 
 
 def recognizes_opencv(source: Source) -> bool:
@@ -47,18 +50,16 @@ def recognizes_opencv(source: Source) -> bool:
         return False
     values = _values(source)
     maps = (value for value in values.values() if isinstance(value, Mapping))
-    return bool(_names(values)) or any({"K", "R", "T"} & set(each) for each in maps)
+    return any(key.startswith("K_") for key in values) or any({"K", "R", "T"} & set(each) for each in maps)
 
 
 def read_opencv(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of one file. Raises: CaptureError naming the key."""
-    values, file = _values(source), source.path
+    values = _values(source)
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
     if not nested:
-        return source.calibration(format, flat_cameras(values, values, (file, file), values.get("names")))
-    before = lambda name: lambda key: f"{name}.{key}"
-    cameras = [one_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
-    return source.calibration(format, cameras)
+        return source.calibration(format, _flat_cameras(values, lambda key: source.path))
+    return source.calibration(format, [_renamed_camera(name, each, {}, source.path, name) for name, each in nested.items()])
 
 
 @functools.lru_cache(maxsize=1)
@@ -67,93 +68,65 @@ def _values(source: Source) -> dict[str, Any]:
     return parse_file_storage(source.text, source.path)
 
 
-def flat_cameras(
-    inner: Mapping[str, Any], outer: Mapping[str, Any], files: tuple[Path, Path], names: Iterable[object] | None
-) -> list[CalibratedCamera]:
-    """Cameras whose names stand behind their keys. inner, outer: intrinsic and extrinsic values, of these files.
+def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of both files. Raises: CaptureError naming file and key."""
+    inner, outer = source.path / "intri.yml", source.path / "extri.yml"
+    values = [parse_file_storage(checked_text(file), file) for file in (inner, outer)]
+    cameras = _flat_cameras(values[0] | values[1], lambda key: outer if key[0] in "RT" else inner)
+    return source.calibration(format, cameras, file=outer)
 
-    names: of the cameras; None: those that have a K. Raises: CaptureError naming file and key.
-    """
-    names = list(names or _names(inner))
+
+def _flat_cameras(values: Mapping[str, Any], file_of: Callable[[str], Path]) -> list[CalibratedCamera]:
+    """Cameras whose names stand behind their keys: those of the list `names`, else those that have a K."""
+    names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
-        raise CaptureError(files[0], "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME")
-    behind = lambda name: lambda key: f"{key}_{name}"
-    own = lambda values, name: _of_camera(values, name, names)
-    return [one_camera(str(name), own(inner, name), own(outer, name), files, behind(name)) for name in names]
+        raise CaptureError(file_of("K"), "", "no camera: expected K, R and T of each, or K_NAME, R_NAME and T_NAME")
+    cameras = []
+    for name in map(str, names):
+        # dist_a_1 is of camera a_1, if there is one, and not of camera 1
+        longer = tuple(f"_{other}" for other in names if len(str(other)) > len(name))
+        own = {key: each for key, each in values.items() if key.endswith(f"_{name}") and not key.endswith(longer)}
+        own = {key.removesuffix(f"_{name}"): each for key, each in own.items()}
+        cameras.append(_one_camera(name, own, lambda key, name=name: (file_of(key), f"{key}_{name}")))
+    return cameras
 
 
-def _names(values: Mapping[str, Any]) -> list[str]:
-    return [key[2:] for key in values if key.startswith("K_")]
+def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str) -> CalibratedCamera:
+    """A camera of an entry in which OpenCV's keys may have other names. keys: theirs -> OpenCV's."""
+    theirs = {ours: key for key, ours in keys.items()} | {keys.get(key, key): key for key in entry}
+    values = {ours: entry[key] for ours, key in theirs.items() if key in entry}
+    return _one_camera(name, values, lambda key: (file, f"{field}.{theirs.get(key, key)}"))
 
 
-def _of_camera(values: Mapping[str, Any], name: object, names: list[Any]) -> dict[str, Any]:
-    """`K_01: ..` of all cameras -> `K: ..` of one. `dist_a_1` is of camera a_1, if there is one, and not of camera 1."""
-    end = f"_{name}"
-    longer = tuple(f"_{other}" for other in names if len(str(other)) > len(str(name)))
-    own = {key: value for key, value in values.items() if key.endswith(end) and not key.endswith(longer)}
-    return {key[: -len(end)]: value for key, value in own.items()}
-
-
-def one_camera(
-    name: str, inner: Mapping[str, Any], outer: Mapping[str, Any], files: tuple[Path, Path], field: Callable[[str], str]
-) -> CalibratedCamera:
-    """A camera of its intrinsic and extrinsic values, and their files. `field` makes keys those of the file, for errors."""
-    if "K" not in inner and {"fx", "fy", "cx", "cy", "T", "R"} <= inner.keys():
-        inner = outer = _of_shelf(inner, files[0], field)
-    inner_file, outer_file = files
-    turn_key = "Rot" if "Rot" in outer else "R"  # EasyMocap has both: the matrix and the rotation vector
-    for key, values, file in (("K", inner, inner_file), (turn_key, outer, outer_file), ("T", outer, outer_file)):
+def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> CalibratedCamera:
+    if "K" not in values and {"fx", "fy", "cx", "cy", "T", "R"} <= values.keys():
+        values = _of_shelf(values, where)
+    turn_key = "Rot" if "Rot" in values else "R"  # EasyMocap has both: the matrix and the rotation vector
+    for key in ("K", turn_key, "T"):
         if key not in values:
-            raise CaptureError(file, field(key), "missing")
-    turn = rotation(outer[turn_key], outer_file, field(turn_key))
-    translation = floats(outer["T"], outer_file, field("T"), (3,))
-    K = floats(inner["K"], inner_file, field("K"), (3, 3))
-    distortion = _distortion(inner, inner_file, field)
-    width, height = _size(inner, inner_file, field)
-    return CalibratedCamera(name, K, pose_matrix(turn, translation), width, height, distortion)
-
-
-def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, prefix: str) -> CalibratedCamera:
-    """A camera of an entry whose `keys` are those of OpenCV by other names."""
-    values = {ours: entry[theirs] for theirs, ours in keys.items() if theirs in entry}
-    theirs = {ours: name for name, ours in keys.items()}
-    return one_camera(name, values, values, (file, file), lambda key: f"{prefix}.{theirs.get(key, key)}")
-
-
-def _of_shelf(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> dict[str, Any]:
-    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is where the camera stands."""
-    fx, fy, cx, cy = (float(floats(values[key], file, field(key), ())) for key in ("fx", "fy", "cx", "cy"))
-    turn = rotation(values["R"], file, field("R"))
-    place = floats(np.ravel(values["T"]).tolist(), file, field("T"), (3,))
-    lens = {}
-    if "k" in values:
-        k = floats(np.ravel(values["k"]).tolist(), file, field("k"), (3,))
-        p = floats(np.ravel(values.get("p", [0, 0])).tolist(), file, field("p"), (2,))
-        lens = {"dist": [k[0], k[1], p[0], p[1], k[2]]}
-    others = {key: value for key, value in values.items() if key not in ("k", "p")}
-    return others | lens | {"K": intrinsics(fx, fy, cx, cy), "R": turn, "T": -turn @ place}
-
-
-def _distortion(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> Float[np.ndarray, "5"] | None:
-    """The coefficients of `D`, `dist`, `distCoeff`, ...; lenses that they do not describe are refused."""
-    coefficients = None
+            raise CaptureError(*where(key), "missing")
+    pose = pose_matrix(rotation(values[turn_key], *where(turn_key)), floats(values["T"], *where("T"), (3,)))
+    K, lens = floats(values["K"], *where("K"), (3, 3)), None
     for key, value in values.items():
-        fisheye = value.lower() in FISHEYE if isinstance(value, str) else key.lower() in FISHEYE and bool(value)
-        if fisheye:
-            raise CaptureError(file, field(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
+        if value.lower() in FISHEYE if isinstance(value, str) else key.lower() in FISHEYE and bool(value):
+            raise CaptureError(*where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
         if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
-            coefficients = brown_conrady(value, file, field(key))
-    return coefficients
+            lens = brown_conrady(value, *where(key))
+    sizes = [values[key] for key in ("imgSize", "image_size") if key in values]
+    sizes += [[values[w], values[h]] for w, h in (("width", "height"), ("W", "H")) if {w, h} <= values.keys()]
+    return CalibratedCamera(name, K, pose, *(image_size(sizes[0], *where("imgSize")) if sizes else (None, None)), lens)
 
 
-def _size(values: Mapping[str, Any], file: Path, field: Callable[[str], str]) -> tuple[int | None, int | None]:
-    for key in SIZE_KEYS:
-        if key in values:
-            return image_size(values[key], file, field(key))
-    for pair in (("width", "height"), ("W", "H")):
-        if all(key in values for key in pair):
-            return image_size([values[key] for key in pair], file, field(pair[0]))
-    return None, None
+def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
+    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is where the camera stands."""
+    numbers = lambda key, *shape: floats(values[key], *where(key), shape)
+    turn, lens = rotation(values["R"], *where("R")), {}
+    if "k" in values:
+        k, p = numbers("k", 3), numbers("p", 2) if "p" in values else (0, 0)
+        lens = {"dist": [k[0], k[1], p[0], p[1], k[2]]}
+    K = intrinsics(*(float(numbers(key)) for key in ("fx", "fy", "cx", "cy")))
+    others = {key: value for key, value in values.items() if key not in ("k", "p")}
+    return others | lens | {"K": K, "R": turn, "T": -turn @ numbers("T", 3)}
 
 
 # FileStorage -----------------------------------------------------------------------------------------------------------
@@ -168,23 +141,20 @@ TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
-    try:
+    with reading(file, "YAML file", CaptureError):
         if text.lstrip().startswith("{"):
-            values = _matrices(checked_json(file, text), file, "")
-        else:
-            with reading(file, "YAML file", CaptureError):
-                check_limit("slow_text_bytes", len(text), "characters of YAML")
-            kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
+            return _matrices(parse_json(text), file, "")
+        check_limit("slow_text_bytes", len(text), "characters of YAML")
+        kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
+        try:
             root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
-            values = {} if root is None else _value(root, file)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise CaptureError(file, "", f"not readable as YAML: {error}") from error
-    if not isinstance(values, dict):
-        raise CaptureError(file, "", "expected keys with values")
-    return values
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
+        values = {} if root is None else _value(root, file)
+        if not isinstance(values, dict):
+            raise Refused("expected keys with values")
+        return values
 
 
 class _Loader(yaml.SafeLoader):
@@ -197,7 +167,7 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
         self.depth += 1
         if self.depth > limits().nesting:
-            raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=self.peek_event().start_mark)
+            raise Refused("nested too deeply")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -228,15 +198,10 @@ def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "
     if tag != MATRIX:
         raise CaptureError(file, where, f"type {tag!r} is not supported: expected {MATRIX}")
     try:
-        return np.asarray(value["data"], np.float64).reshape(int(value["rows"]), _columns(value))
+        channels = int(re.sub(r"\D.*", "", str(value["dt"])) or 1)  # dt is "d", or "3d" with three channels
+        return np.asarray(value["data"], np.float64).reshape(int(value["rows"]), int(value["cols"]) * channels)
     except (KeyError, TypeError, ValueError) as error:
         raise CaptureError(file, where, f"not a matrix of rows, cols, dt and data: {error}") from error
-
-
-def _columns(value: Mapping[str, Any]) -> int:
-    """Columns times channels; dt is "d", or "3d" with three channels."""
-    channels = re.match(r"\d*", str(value["dt"]))
-    return int(value["cols"]) * int(channels[0] if channels and channels[0] else 1)
 
 
 def _matrices(value: Any, file: Path, field: str) -> Any:
@@ -250,20 +215,9 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
     return {key: _matrices(item, file, f"{field}.{key}".lstrip(".")) for key, item in value.items()}
 
 
-# EasyMocap -------------------------------------------------------------------------------------------------------------
-
-
-def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
-    """The cameras of both files. Raises: CaptureError naming file and key."""
-    files = source.path / "intri.yml", source.path / "extri.yml"
-    inner, outer = (parse_file_storage(checked_text(file), file) for file in files)
-    cameras = flat_cameras(inner, outer, files, outer.get("names", inner.get("names")))
-    return source.calibration(format, cameras, file=files[1])
-
-
 # CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution --------------------------------------
 
-PANOPTIC_KEYS = {"K": "K", "distCoef": "dist", "R": "R", "T": "T", "t": "T", "resolution": "imgSize"}
+PANOPTIC_KEYS = {"t": "T", "resolution": "imgSize"}
 
 
 def recognizes_panoptic(source: Source) -> bool:
@@ -282,8 +236,7 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
 
 # TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
 
-TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}
-"""Names in the tables, and those of OpenCV's files."""
+TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "size": "imgSize"}
 
 
 def recognizes_toml(source: Source) -> bool:
@@ -307,10 +260,7 @@ def read_toml(source: Source, format: CameraFormat) -> Calibration:
 @functools.lru_cache(maxsize=1)
 def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
     check_limit("slow_text_bytes", len(source.text), "characters of TOML")
-    try:
-        content = tomllib.loads(source.text)
-    except tomllib.TOMLDecodeError as error:
-        raise Refused(f"not valid TOML: {error}") from error
+    content = tomllib.loads(source.text)
     check_nesting(content)
     found = {}
     for key, value in content.items():
@@ -339,11 +289,7 @@ def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
         raise Refused("XML with entities, which are not read")
-    try:
-        root = tree.fromstring(source.text)
-    except tree.ParseError as error:
-        raise Refused(f"not valid XML: {error}") from error
-    elements = [each for each in root.iter("camera") if each.find("transform") is not None]
+    elements = [each for each in tree.fromstring(source.text).iter("camera") if each.find("transform") is not None]
     cameras = [_camera(element, f"camera {i}", source) for i, element in enumerate(elements)]
     if not cameras:
         raise CaptureError(source.path, "", "no camera with a transform")
@@ -352,25 +298,19 @@ def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
 
 def _camera(element: tree.Element, field: str, source: Source) -> CalibratedCamera:
     def number(part: str, key: str) -> float:
-        found = element.find(part)
-        text = None if found is None else found.get(key)
+        text = getattr(element.find(part), "attrib", {}).get(key, "")
         try:
-            value = float(text or "")
+            return float(floats(float(text), source.path, f"{field}.{part}.{key}", ()))
         except ValueError:
-            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a number, got {text!r}") from None
-        if not np.isfinite(value) or abs(value) > 1e12:
-            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a finite number, got {value}")
-        return value
+            raise CaptureError(source.path, f"{field}.{part}.{key}", f"expected a finite number, got {text!r}") from None
 
-    turn = np.asarray([[number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)])
-    turn = np.diag([1.0, -1, -1]) @ turn
+    turn = np.diag([1.0, -1, -1]) @ [[number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)]
     place = METRES * np.asarray([number("transform", axis) for axis in "xyz"])
-    view = {side: number("fov_video", side) for side in ("left", "top", "right", "bottom")}
+    left, top, right, bottom = (number("fov_video", side) for side in ("left", "top", "right", "bottom"))
     focal = [number("intrinsic", f"focalLength{axis}") / SUBPIXELS for axis in "UV"]
     center = [number("intrinsic", f"centerPoint{axis}") / SUBPIXELS for axis in "UV"]
-    K = intrinsics(*focal, center[0] - view["left"], center[1] - view["top"])
-    size = [view["right"] - view["left"] + 1, view["bottom"] - view["top"] + 1]
-    width, height = image_size(size, source.path, f"{field}.fov_video")
+    K = intrinsics(*focal, center[0] - left, center[1] - top)
+    size = image_size([right - left + 1, bottom - top + 1], source.path, f"{field}.fov_video")
     lens = brown_conrady([number("intrinsic", key) for key in LENS], source.path, f"{field}.intrinsic")
     name = element.get("serial") or element.get("name") or field
-    return CalibratedCamera(name, K, pose_matrix(turn, -turn @ place), width, height, lens)
+    return CalibratedCamera(name, K, pose_matrix(turn, -turn @ place), *size, lens)

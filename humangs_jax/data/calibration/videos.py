@@ -19,7 +19,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.io.images import image_in, image_size
+from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
@@ -72,19 +72,26 @@ def split_video(path: Path, folder: Path, every: int = 1, most: int | None = Non
     """Write frames of a video as 00000000.png, ... into a new folder.
 
     Arguments: before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
-    Returns: pixels of all frames so far. The first frame is written twice: its size tells how many the others may be.
+    Returns: pixels of all frames so far.
     Raises: CaptureError naming the video.
     """
     with reading(path, "video", CaptureError):
-        open_file(path).close()  # no devices, no pipes, not too large
+        width, height = _frame_size(path)
         folder.mkdir(parents=True)
-        select = f"not(mod(n\\,{every}))"
-        first = _run(path, folder, select, 1)
-        width, height = image_size(next(folder.iterdir()))
-        size, room = width * height, max(0, limits().video_pixels - before) // (width * height)
-        count = first if most == 1 else _run(path, folder, select, room + 1 if most is None else min(most, room + 1))
-        _check_pixels(before + count * size, count, width, height)
-        return before + count * size
+        room = max(0, limits().video_pixels - before) // (width * height)
+        count = _run(path, folder, f"not(mod(n\\,{every}))", room + 1 if most is None else min(most, room + 1))
+        pixels = before + count * width * height
+        _check_pixels(pixels, count, width, height)
+        return pixels
+
+
+def _frame_size(path: Path) -> tuple[int, int]:
+    open_file(path).close()  # no devices, no pipes, not too large
+    first = _finished(path, [*_ffmpeg(path, "null"), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"])
+    if not first:
+        raise _said(path, b"")
+    with image_in(first) as image:
+        return image.size
 
 
 def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
@@ -108,23 +115,14 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
 def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
     """All frames of a video, one after the other, grey and no larger than that. Raises: CaptureError naming the video."""
     with reading(path, "video", CaptureError):
-        open_file(path).close()
-        picture = ["-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"]
-        first = _finished(path, [*_ffmpeg(path, "null"), *picture])
-        if not first:
-            raise _said(path, b"")
-        with image_in(first) as image:
-            width, height = image.size
+        width, height = _frame_size(path)
         room, scale = limits().video_pixels // (width * height), min(1.0, longer_side / max(width, height))
         w, h = (max(1, round(side * scale)) for side in (width, height))
         command = [*_ffmpeg(path, f"scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
         command += ["-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-            assert process.stdout is not None and process.stderr is not None
-            said, errors, count = [], process.stderr, 0
-            listener = threading.Thread(target=lambda: said.append(errors.read()))
-            clock = threading.Timer(LONGEST_SECONDS, process.kill)
-            listener.start()
+        with tempfile.TemporaryFile() as said, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process:
+            assert process.stdout is not None
+            clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
             clock.start()
             try:
                 while len(data := process.stdout.read(w * h)) == w * h:
@@ -132,12 +130,11 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
                     _check_pixels(count * width * height, count, width, height)
                     yield np.frombuffer(data, np.uint8).reshape(h, w)
                 if process.wait():
-                    listener.join()
-                    raise _said(path, said[0])
+                    said.seek(0)
+                    raise _said(path, said.read())
             finally:
                 clock.cancel()
                 process.kill()
-                listener.join()
 
 
 def _ffmpeg(path: Path, filters: str) -> list[str]:
