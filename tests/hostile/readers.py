@@ -115,9 +115,8 @@ def read_data_set(folder):
 
 def read_scans(folder):
     """What preprocessing reads and computes of scans before it renders them."""
-    thuman = open_thuman(folder)
-    for name in thuman.names:
-        scan_content(name, thuman, data_body(), Settings("thuman", views=1))
+    for name in open_thuman(folder)[0]:
+        scan_content(folder, name, data_body(), Settings("thuman", views=1))
 
 
 def continue_preprocessing(folder):

@@ -102,15 +102,8 @@ def _first_row(values: ArrayFile, key: str, count: int) -> Float[np.ndarray, " s
 
 
 def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
-    """Cameras of {"NAME": {"K": [9], "R": [9], "T": [3], "imgSize": [W, H]}}, pixel centres at +0.5.
-
-    The world's axes stay as they are. Raises: CaptureError naming file and camera.
-    """
-
-    def no_size(name: str) -> tuple[int, int]:
-        raise CaptureError(file, f"{name}.imgSize", "missing")
-
-    calibration = read_calibration(file, no_size)
+    """The cameras of a file, pixel centres at +0.5; the world's axes stay. Raises: CaptureError naming file and camera."""
+    calibration = read_calibration(file, lambda name: (0, 0))  # sizes are in the file
     return checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
 
 
@@ -139,15 +132,10 @@ def plain_number(stem: str) -> int | None:
 
 def numbered(folder: Path, frame_of: Callable[[str], int | None]) -> dict[int, Path]:
     """Frame -> its file, of the photos in a folder; empty if it does not exist."""
-    found = {}
-    if folder.is_dir():
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                stem, suffix = os.path.splitext(entry.name)
-                frame = frame_of(stem) if suffix.lower() in PHOTO_SUFFIXES else None
-                if frame is not None:
-                    found[frame] = folder / entry.name
-    return found
+    names = os.listdir(folder) if folder.is_dir() else ()
+    stems = [os.path.splitext(name) for name in names]
+    frames = [frame_of(stem) if suffix.lower() in PHOTO_SUFFIXES else None for stem, suffix in stems]
+    return {frame: folder / name for frame, name in zip(frames, names, strict=True) if frame is not None}
 
 
 def read_missing(file: Path) -> set[tuple[str, int]]:
@@ -156,13 +144,11 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
         return set()
     found = set()
     for number, line in enumerate(read_text(file).splitlines(), 1):
-        if not line.strip():
-            continue
-        parts = [part for part in re.split(r"[\\/]+", line.strip()) if part]
-        frame = parts[-1].partition(".")[0] if parts else ""
-        if len(parts) < 2 or not re.fullmatch(r"[0-9]{1,18}", frame):
-            raise CaptureError(file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}")
-        found.add((parts[-2], int(frame)))
+        if line.strip():
+            named = re.search(r"([^\\/]+)[\\/]+([0-9]{1,18})(?:\.[^\\/]*)?$", line.strip())
+            if named is None:
+                raise CaptureError(file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}")
+            found.add((named[1], int(named[2])))
     return found
 
 
@@ -259,9 +245,8 @@ AVATARREX = FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
 
 def find_subjects(layout: FolderLayout, folder: str | Path) -> tuple[Path, ...]:
     """The subjects in a folder, sorted, or the folder itself; empty if there are none."""
-    above = layout.photos.replace("NAME", "")
-    is_one = lambda path: (path / layout.calibration).is_file() and (path / above).is_dir()
-    return subfolders(folder, is_one)
+    above = layout.photos.removesuffix("NAME")
+    return subfolders(folder, lambda path: (path / layout.calibration).is_file() and (path / above).is_dir())
 
 
 def subfolders(folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1) -> tuple[Path, ...]:
@@ -399,14 +384,14 @@ class Smc:
         """Finite float64 numbers of a shape."""
         return checked_numbers(self.array(key), self.path, key, shape, largest=largest)
 
-    def image(self, key: str) -> Float[np.ndarray, "h w c"]:
-        """An encoded photo in [0, 1]."""
+    def image(self, key: str, made_of: Callable[[Any], T]) -> T:
+        """What a function makes of an encoded photo, one of PIL."""
         data = self.array(key, "image_bytes")
         with reading(f"{self.path}: {key}", "image", CaptureError):
             if data.dtype != np.uint8 or data.ndim != 1:
                 raise Refused(f"expected encoded bytes, got {data.dtype} of shape {data.shape}")
             with image_in(data.tobytes()) as image:
-                return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
+                return made_of(image)
 
 
 def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
@@ -425,11 +410,16 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         cameras.append(_camera(notes, number, photos, shown[-1][min(shown[-1])] if shown[-1] else None))
 
     def read(photo: str, mask: str) -> Photo:
-        return _cut_out(photos.image(photo), notes.image(mask).max(axis=-1) > ON_PERSON, notes.path, mask)
+        image, person = (file.image(key, _colors) for file, key in ((photos, photo), (notes, mask)))
+        return _cut_out(image, person.max(axis=-1) > ON_PERSON, notes.path, mask)
 
     calibration = Calibration("DNA-Rendering", notes.path, tuple(cameras), False, "integer", "+y")
     cameras = checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
     return video_subject(main, cameras, shown, masks, read, parameters, digits=6)
+
+
+def _colors(image: Any) -> Float[np.ndarray, "h w 3"]:
+    return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
 
 
 def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
@@ -444,13 +434,7 @@ def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
 def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> CalibratedCamera:
     at = f"Camera_Parameter/{number:02d}"
     K, pose = notes.numbers(f"{at}/K", (3, 3)), notes.numbers(f"{at}/RT", (4, 4))
-    R = pose[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 5e-3 or np.linalg.det(R) < 0:
-        raise CaptureError(notes.path, f"{at}/RT", "the rotation is singular, mirrored or scaled")
     lens = brown_conrady(notes.array(f"{at}/D").reshape(-1), notes.path, f"{at}/D")
-    size = (1, 1)
-    if first is not None:
-        data = photos.array(first, "image_bytes")
-        with reading(f"{photos.path}: {first}", "image", CaptureError), image_in(data.astype(np.uint8).tobytes()) as image:
-            size = image.size
-    return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), size[0], size[1], lens)
+    width, height = (1, 1) if first is None else photos.image(first, lambda image: image.size)
+    with reading(f"{notes.path}: {at}/RT", "pose", CaptureError):
+        return CalibratedCamera(f"{number:02d}", K, np.linalg.inv(pose), width, height, lens)

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
+from humangs_jax.data.calibration.calibration import intrinsics
+from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, expect, members
 from humangs_jax.data.datasets.subject import (
     STORED_SIZE,
     BodyParameters,
@@ -33,7 +34,7 @@ from humangs_jax.data.datasets.subject import (
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_grey, read_image
-from humangs_jax.io.reading import inside, reading, shown, write_json
+from humangs_jax.io.reading import inside, reading, shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
@@ -72,16 +73,13 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 
     Raises: CaptureError naming file and key.
     """
-    file = _list_of(path)
+    file, scenes = _list_of(path), {}
     content = checked_json(file)
     if not isinstance(content, list) or not content:
-        raise CaptureError(file, "", f"expected a list of scenes, got {type(content).__name__}")
-    scenes = {}
+        raise CaptureError(file, "", f"expected a list of scenes, got {shown(content)}")
     for i, scene in enumerate(content):
-        if not isinstance(scene, dict):
-            raise CaptureError(file, f"[{i}]", f"expected a JSON object, got {type(scene).__name__}")
-        name = required(scene, "scene_name", file, f"[{i}].")
-        if not isinstance(name, str) or not name or name in scenes:
+        (name,) = members(scene, file, f"[{i}]", scene_name=str)
+        if name in scenes:
             raise CaptureError(file, f"[{i}].scene_name", f"expected a name of its own, got {shown(name)}")
         scenes[name] = scene
     return scenes
@@ -95,18 +93,11 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
     file = _list_of(path)
     scenes = read_scene_list(file)
     if size is None:
-        size = _first_size(file, scenes)
+        firsts = (file.parent / scene_frames(file, name, scene)[0].image for name, scene in scenes.items())
+        first = next((image for image in firsts if image.is_file()), None)
+        size = STORED_SIZE if first is None else max(read_checked(image_size, first))
     opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)
     return tuple(Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items())
-
-
-def _first_size(file: Path, scenes: Mapping[str, dict[str, Any]]) -> int:
-    for name, scene in scenes.items():
-        for frame in _frames(scene, file, name)[:1]:
-            path = file.parent / str(frame.get("image_path", ""))
-            if path.is_file():
-                return max(read_checked(image_size, path))
-    return STORED_SIZE
 
 
 def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
@@ -129,9 +120,6 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
         rotations = np.asarray([rotation for rotation, _ in poses]).reshape(-1, joints, 3)
         return BodyParameters(betas, rotations, np.asarray([t for _, t in poses]).reshape(-1, 3))
 
-    def read(view: int):
-        return _read_view(file, name, views[view])
-
     sizes = np.asarray([read_checked(image_size, _inside(file, name, views[0].image))] * len(views))
     K, poses = np.stack([view.K for view in views]), np.stack([view.cam_from_world for view in views])
     for i in range(len(views)):
@@ -146,7 +134,7 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
         cameras=np.arange(len(views)),
         frame_count=len(arrays),
         view_name=lambda view: f"{view:05d}",
-        read=read,
+        read=lambda view: _read_view(file, name, views[view]),
         parameters=parameters,
         missing=missing,
     )
@@ -154,47 +142,25 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
 
 def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneFrame]:
     """The frames of a scene, checked. Raises: CaptureError naming file and key."""
-    views = []
-    for i, frame in enumerate(_frames(scene, file, name)):
-        at = f"{name}.frames[{i}]."
-        if not isinstance(frame, dict):
-            raise CaptureError(file, at[:-1], f"expected a JSON object, got {type(frame).__name__}")
-        texts = [required(frame, key, file, at) for key in ("image_path", "smpl_path")]
-        for key, text in zip(("image_path", "smpl_path"), texts, strict=True):
-            if not isinstance(text, str) or not text:
-                raise CaptureError(file, at + key, f"expected the path of a file, got {shown(text)}")
-        pose = checked_numbers(_array(frame, "w2c", file, at), file, f"{at}w2c", (4, 4))
-        fx, fy, cx, cy = checked_numbers(_array(frame, "fxfycxcy", file, at), file, f"{at}fxfycxcy", (4,))
-        K = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        views.append(SceneFrame(texts[0], pose, K, texts[1], frame.get("mask_path")))
+    views, (frames,) = [], members(scene, file, name, frames=list)
+    for i, frame in enumerate(frames):
+        at = f"{name}.frames[{i}]"
+        image, arrays, pose, inner = members(frame, file, at, image_path=str, smpl_path=str, w2c=list, fxfycxcy=list)
+        K = intrinsics(*checked_numbers(inner, file, f"{at}.fxfycxcy", (4,)).tolist())
+        views.append(SceneFrame(image, checked_numbers(pose, file, f"{at}.w2c", (4, 4)), K, arrays, frame.get("mask_path")))
+    if not views:
+        raise CaptureError(file, f"{name}.frames", "expected at least one frame")
     return views
-
-
-def _array(frame: Mapping[str, Any], key: str, file: Path, at: str) -> np.ndarray:
-    value = required(frame, key, file, at)
-    try:
-        return np.asarray(value)
-    except ValueError:
-        raise CaptureError(file, at + key, "expected rows of one length") from None
-
-
-def _frames(scene: Mapping[str, Any], file: Path, name: str) -> list[Any]:
-    frames = required(scene, "frames", file, f"{name}.")
-    if not isinstance(frames, list) or not frames:
-        raise CaptureError(file, f"{name}.frames", "expected a list of at least one frame")
-    return frames
 
 
 def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[SceneFrame], dict[str, int]]:
     """Frames whose image and arrays are there, and how many are not."""
     views, missing = [], {"no image": 0, "no smpl_path": 0}
-    known: dict[str, bool] = {}
+    is_there = functools.lru_cache(None)(lambda path: _inside(file, name, path).is_file())
     for view in scene_frames(file, name, scene):
-        if view.arrays not in known:
-            known[view.arrays] = _inside(file, name, view.arrays).is_file()
-        if not known[view.arrays]:
+        if not is_there(view.arrays):
             missing["no smpl_path"] += 1
-        elif not _inside(file, name, view.image).is_file():
+        elif not is_there(view.image):
             missing["no image"] += 1
         else:
             views.append(view)
@@ -264,21 +230,12 @@ def write_arrays(
     write_npz(path, {name: array.astype(np.float32) for name, array in arrays.items()} | {"faces": faces.astype(np.int32)})
 
 
-def write_list(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
-    """A list of scenes; compact, since 2,300 scenes of 60 views are 50 MB."""
-    write_json(path, list(entries), indent=None)
-
-
 def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
     """Context and target views of each scene. Raises: CaptureError naming file and key."""
     file = Path(path)
     content = checked_json(file)
-    if not isinstance(content, dict):
-        raise CaptureError(file, "", f"expected scenes by name, got {type(content).__name__}")
-    for name, views in content.items():
-        for key in ("context", "target"):
-            chosen = required(views, key, file, f"{name}.") if isinstance(views, dict) else None
-            whole = isinstance(chosen, list) and all(type(view) is int and view >= 0 for view in chosen)
-            if not whole or not chosen:
-                raise CaptureError(file, f"{name}.{key}", f"expected numbers of views, got {str(chosen)[:40]}")
+    for name, views in expect(content, dict, file, "").items():
+        for key, chosen in zip(("context", "target"), members(views, file, name, context=list, target=list), strict=True):
+            if not chosen or not all(type(view) is int and view >= 0 for view in chosen):
+                raise CaptureError(file, f"{name}.{key}", f"expected numbers of views, got {shown(chosen)}")
     return content

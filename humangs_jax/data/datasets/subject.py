@@ -196,8 +196,8 @@ def recover_pose(
 
     R = transforms[:, :3, :3]
     off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    if (worst := int(off.argmax())) is not None and (off[worst] > 1e-3 or (np.linalg.det(R) < 0).any()):
-        raise CaptureError(file, "joint_transforms", f"number {worst} is no rotation: R R^T must be 1 and det R = 1")
+    if off.max() > 1e-3 or (np.linalg.det(R) < 0).any():
+        raise CaptureError(file, "joint_transforms", "expected rotations: R R^T = 1 and det R = 1")
     parents = np.asarray(body.model.parents)
     above = np.where((parents < 0)[:, None, None], np.eye(3), R[np.maximum(parents, 0)])
     rotations = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ R).as_rotvec()
@@ -209,6 +209,8 @@ def recover_pose(
 
 STORED_SIZE = 512
 """Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it."""
+Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
+"""An image on white and its mask."""
 THREADS = min(8, os.cpu_count() or 1)
 """That decode the photos of one request: JPEG decoding releases the interpreter's lock."""
 
@@ -250,7 +252,7 @@ class Subject:
         K[:, :2] *= (size / side)[:, None, None]
         return K
 
-    def photo(self, view: int, size: int) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]:
+    def photo(self, view: int, size: int) -> Photo:
         """Image on white and mask of one view, padded to a centred square and resized. Raises: ValueError naming the file."""
         image, mask = self.read(view)
         width, height = self.sizes[view].tolist()
@@ -266,17 +268,28 @@ class Subject:
             image, mask = resized(image, size, size), resized(mask, size, size)
         return to_uint8(image), to_uint8(mask)
 
+    def tried(self, views: Sequence[int] | Int[np.ndarray, " any"], size: int) -> list[Photo | Exception]:
+        """Several of these, decoded in parallel; in place of those that cannot be read, why."""
+
+        def photo(view: int) -> Photo | Exception:
+            try:
+                return self.photo(view, size)
+            except (ValueError, OSError) as error:
+                return error
+
+        with concurrent.futures.ThreadPoolExecutor(min(THREADS, len(views))) as pool:
+            return list(pool.map(photo, map(int, views)))
+
     def photos(
         self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
     ) -> tuple[UInt8[np.ndarray, "any size size 3"], UInt8[np.ndarray, "any size size"]]:
         """Several of these, decoded in parallel. Raises: as `photo`."""
-        views = [int(view) for view in views]
-        if len(views) == 1:
-            found = [self.photo(views[0], size)]
-        else:
-            with concurrent.futures.ThreadPoolExecutor(min(THREADS, len(views))) as pool:
-                found = list(pool.map(lambda view: self.photo(view, size), views))
-        images, masks = zip(*found, strict=True)
+        images, masks = [], []
+        for photo in self.tried(views, size):
+            if isinstance(photo, Exception):
+                raise photo
+            images.append(photo[0])
+            masks.append(photo[1])
         return np.stack(images), np.stack(masks)
 
     def capture(self, views: Sequence[int] | Int[np.ndarray, " any"], body: FileBody, size: int = STORED_SIZE) -> Capture:

@@ -14,7 +14,6 @@ posed it: the error of our body against it says whether fit, kind and model file
 """
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -33,13 +32,12 @@ from humangs_jax.data.datasets.subject import (
     open_arrays,
     posed_people,
 )
-from humangs_jax.io.images import check_image
+from humangs_jax.io.arrays import check_array, check_indices
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.reading import Refused, read_text, reading
 
 Kind = Literal["A", "B", "C"]
 PCA_NUMBERS, HAND_NUMBERS = 12, 45
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 FIT, FIT_MESH = "smplx_param.pkl", "mesh_smplx.obj"
 TOLERANCE = 2e-3
 """Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of OBJ files is far below;
@@ -72,39 +70,28 @@ class Scan:
     texture: UInt8[np.ndarray, "th tw 3"]
 
 
-@dataclasses.dataclass(frozen=True)
-class ThumanSet:
-    """The scans of a folder. names: sorted. skipped: name -> why it cannot be used, of those that lack a file."""
-
-    folder: Path
-    names: tuple[str, ...]
-    skipped: Mapping[str, str]
-
-    def scan_file(self, name: str) -> Path:
-        """The mesh of a scan."""
-        return self.folder / "model" / name / f"{name}.obj"
-
-    def fit_file(self, name: str) -> Path:
-        """The fit of a scan."""
-        return self.folder / "smplx" / name / FIT
-
-
 def find_thuman(folder: str | Path) -> tuple[Path, ...]:
     """The folder, if it holds scans."""
     folder = Path(folder)
     return (folder,) if (folder / "model").is_dir() and (folder / "smplx").is_dir() else ()
 
 
-def open_thuman(folder: str | Path) -> ThumanSet:
-    """The scans of a folder that holds model/ and smplx/; nothing is read yet. Raises: CaptureError if there are none."""
+def scan_files(folder: Path, name: str) -> tuple[Path, Path]:
+    """The mesh and the fit of a scan."""
+    return folder / "model" / name / f"{name}.obj", folder / "smplx" / name / FIT
+
+
+def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
+    """The names of the scans in a folder that holds model/ and smplx/, sorted; and why others cannot be used, by name.
+
+    Raises: CaptureError if there are none.
+    """
     folder = Path(folder)
-    models = folder / "model"
-    if not models.is_dir():
+    if not (folder / "model").is_dir():
         raise CaptureError(folder, "model", "no such folder: expected THuman's model/ and smplx/")
-    found = ThumanSet(folder, (), {})
     names, skipped = [], {}
-    for name in sorted(entry.name for entry in models.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
-        missing = [path for path in (found.scan_file(name), found.fit_file(name)) if not path.is_file()]
+    for name in sorted(entry.name for entry in (folder / "model").iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+        missing = [file for file in scan_files(folder, name) if not file.is_file()]
         if missing:
             skipped[name] = f"{missing[0]}: no such file"
         else:
@@ -112,7 +99,7 @@ def open_thuman(folder: str | Path) -> ThumanSet:
     if not names:
         why = f" ({next(iter(skipped.values()))})" if skipped else ""
         raise CaptureError(folder, "", f"no scan with a fit{why}: expected model/ID/ID.obj and smplx/ID/{FIT}")
-    return ThumanSet(folder, tuple(names), skipped)
+    return names, skipped
 
 
 # Fits -----------------------------------------------------------------------------------------------------------------
@@ -125,13 +112,13 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     if ("transl" in values) == ("translation" in values):
         raise CaptureError(file, "transl", "expected either transl (THuman2.1, fixed fits) or translation (older fits)")
     of_kind = "transl" if "transl" in values else "translation"
-    hands = [values.numbers(f"{side}_hand_pose", (1, None), LARGEST_ANGLE)[0] for side in ("left", "right")]
+    keys = ("left_hand_pose", "right_hand_pose")
+    hands = [values.numbers(key, (1, None), LARGEST_ANGLE)[0] for key in keys]
     length = len(hands[0])
     lengths = (HAND_NUMBERS,) if of_kind == "transl" else (PCA_NUMBERS, HAND_NUMBERS)
-    for side, hand in zip(("left", "right"), hands, strict=True):
+    for key, hand in zip(keys, hands, strict=True):
         if len(hand) not in lengths or len(hand) != length:
-            wanted = " or ".join(map(str, lengths))
-            raise CaptureError(file, f"{side}_hand_pose", f"expected {wanted} numbers beside {of_kind}, got {len(hand)}")
+            raise CaptureError(file, key, f"expected {' or '.join(map(str, lengths))} numbers beside {of_kind}, got {len(hand)}")
     kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
     scale = values.number("scale")
     if not scale > 0:
@@ -184,27 +171,12 @@ def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> 
 def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
     """Vertices and triangles of an OBJ file, every vertex once and in the order of the file. Raises: CaptureError."""
     with reading(file, "mesh", CaptureError):
-        vertices, faces = [], []
-        for number, line in enumerate(read_text(file).splitlines(), 1):
-            kind, _, rest = line.partition(" ")
-            if kind not in ("v", "f"):
-                continue
-            words = rest.split()
-            try:
-                (vertices if kind == "v" else faces).append(
-                    [float(word) for word in words[:3]] if kind == "v" else [int(w.partition("/")[0]) for w in words]
-                )
-            except ValueError:
-                raise Refused(f"line {number}: expected numbers, got {line[:60]!r}") from None
-            if len(words) != 3 and (kind == "f" or len(words) < 3):
-                raise Refused(f"line {number}: expected three numbers, got {len(words)}")
-        if not vertices or not faces:
-            raise Refused(f"{len(vertices)} vertices and {len(faces)} faces: expected a mesh")
-        points, corners = np.asarray(vertices), np.asarray(faces) - 1
-        if not np.isfinite(points).all():
-            raise Refused("v: expected finite numbers")
-        if corners.min() < 0 or corners.max() >= len(points):
-            raise Refused(f"f: expected vertices 1 to {len(points)}, got {corners.min() + 1} to {corners.max() + 1}")
+        lines = [line.split() for line in read_text(file).splitlines()]
+        points = np.asarray([line[1:4] for line in lines if line[:1] == ["v"]], float)
+        faces = [[corner.partition("/")[0] for corner in line[1:]] for line in lines if line[:1] == ["f"]]
+        corners = np.asarray(faces, int) - 1
+        check_array("v", points, (None, 3))
+        check_indices("f", corners, (None, 3), len(points))
         return points, corners
 
 
@@ -223,15 +195,8 @@ def read_scan(file: str | Path) -> Scan:
         if uvs is None:
             raise Refused("no texture coordinates: expected a textured scan")
         if image is None or max(image.size) <= 2:  # trimesh leaves out what it cannot read, or puts a placeholder there
-            for path in sorted(Path(file).parent.iterdir()):
-                if path.suffix.lower() in PHOTO_SUFFIXES:
-                    check_image(path)
             raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
-        if uvs.shape != (len(vertices), 2):
-            raise Refused(f"texture coordinates: expected shape ({len(vertices)}, 2), got {uvs.shape}")
-        for name, values in (("vertices", vertices), ("texture coordinates", uvs)):
-            if not np.isfinite(values).all():
-                raise Refused(f"{name}: expected finite numbers")
-        texture = np.asarray(image.convert("RGB"))
-        return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, texture)
+        check_array("vertices", vertices, (None, 3))
+        check_array("texture coordinates", uvs, (len(vertices), 2))
+        return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, np.asarray(image.convert("RGB")))

@@ -11,7 +11,7 @@ of 0.3 and one headlight, and no strength of the latter: with 0.7 a surface that
 import dataclasses
 import functools
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import jax
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int, UInt8
-from humangs_jax.data.calibration.calibration import pose_matrix
+from humangs_jax.data.calibration import calibration
 from humangs_jax.data.datasets.thuman import Scan
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.mesh import face_areas, smallest_turns, unit, vertex_crosses
@@ -68,7 +68,7 @@ def scan_alignment(
 ) -> Float[np.ndarray, "4 4"]:
     """`mesh_transform` of a scan, R @ T: first the middle of its bounding box to the origin, then upright."""
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return pose_matrix(R, -R @ box_middle(scan))
+    return calibration.pose_matrix(R, -R @ box_middle(scan))
 
 
 def video_alignment(
@@ -76,18 +76,13 @@ def video_alignment(
 ) -> Float[np.ndarray, "4 4"]:
     """`mesh_transform` of a video, T @ R: upright first, then the middle of the turned body of frame 0 to the origin."""
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return pose_matrix(R, -box_middle(body @ R.T))
-
-
-def bounding_radius(points: Float[np.ndarray, "n 3"]) -> float:
-    """The largest distance from the origin."""
-    return float(np.linalg.norm(points, axis=1).max())
+    return calibration.pose_matrix(R, -box_middle(body @ R.T))
 
 
 def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
     """K of square images, field of view `VERTICAL_FOV`."""
     focal = 0.5 * size / np.tan(0.5 * VERTICAL_FOV)
-    return np.asarray([[focal, 0, 0.5 * size], [0, focal, 0.5 * size], [0, 0, 1]])
+    return calibration.intrinsics(focal, focal, 0.5 * size, 0.5 * size)
 
 
 def scan_cameras(number: int, radius: float, views: int, factors: tuple[float, float]) -> Float[np.ndarray, "v 4 4"]:
@@ -145,6 +140,7 @@ class ScanRenderer:
     """A scan on the device, aligned, with a texture for each view's distance.
 
     vertices, normals: (n, 3), faces: (f, 3), padded. uvs: (n, 2). scan: where the texture comes from. texel: scan units a texel.
+    textures: halved so many times, as far as they were needed.
     """
 
     vertices: Float[Array, "n 3"]
@@ -153,6 +149,7 @@ class ScanRenderer:
     uvs: Float[Array, "n 2"]
     scan: Scan
     texel: float
+    textures: dict[int, Float[Array, "th tw 3"]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, scan: Scan, vertices: Float[np.ndarray, "n 3"]) -> "ScanRenderer":
@@ -180,18 +177,13 @@ class ScanRenderer:
 
     def texture(self, level: int) -> Float[Array, "th tw 3"]:
         """The texture halved `level` times, in [0, 1]."""
-        return self._levels(min(level, int(np.log2(min(self.scan.texture.shape[:2])))))
-
-    @functools.cached_property
-    def _levels(self) -> Callable[[int], Float[Array, "th tw 3"]]:
-        @functools.lru_cache(maxsize=2)
-        def halved(level: int) -> Float[Array, "th tw 3"]:
+        level = min(level, min(self.scan.texture.shape[:2]).bit_length() - 1)
+        if level not in self.textures:
             step = 1 << level
             height, width = (side // step * step for side in self.scan.texture.shape[:2])
             blocks = self.scan.texture[:height, :width].reshape(height // step, step, width // step, step, 3)
-            return jnp.asarray(blocks.mean(axis=(1, 3), dtype=np.float32) / 255)
-
-        return halved
+            self.textures[level] = jnp.asarray(blocks.mean(axis=(1, 3), dtype=np.float32) / 255)
+        return self.textures[level]
 
 
 def smooth_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:

@@ -15,28 +15,28 @@ import dataclasses
 import functools
 import os
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import bar
 from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError, checked_json, expect, members
-from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays, write_list
-from humangs_jax.data.datasets.subject import BodyParameters, FileBody, PosedPerson, Subject, posed_people, turned
+from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays
+from humangs_jax.data.datasets.subject import BodyParameters, FileBody, Photo, PosedPerson, posed_people, turned
 from humangs_jax.data.datasets.thuman import (
     FIT_MESH,
-    ThumanSet,
     fit_error,
     fitted_body,
     open_thuman,
     read_fit,
     read_fit_mesh,
     read_scan,
+    scan_files,
 )
 from humangs_jax.data.formats import DATASETS
 from humangs_jax.data.photos import write_description
@@ -52,7 +52,6 @@ from humangs_jax.data.preprocess.protocol import (
     TRAIN,
     VIEWS,
     ScanRenderer,
-    bounding_radius,
     evaluation_indices,
     intrinsics,
     moved,
@@ -70,8 +69,6 @@ from humangs_jax.io.reading import write_json
 SKIPPED = "skipped"
 SCENE, CAPTURE = "scene.json", "capture.json"
 Layout = Literal["scenes", "capture"]
-Photo = tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]
-"""An image on white and its mask."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,17 +98,6 @@ class Settings:
     def mark(self) -> str:
         """The file that a finished folder holds."""
         return SCENE if self.layout == "scenes" else CAPTURE
-
-
-class View(NamedTuple):
-    """A photo to be written. frame: which of the poses it shows. lengths are those of the scene."""
-
-    name: str
-    frame: int
-    K: Float[np.ndarray, "3 3"]
-    cam_from_world: Float[np.ndarray, "4 4"]
-    image: UInt8[np.ndarray, "h w 3"]
-    mask: UInt8[np.ndarray, "h w"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,17 +142,20 @@ def preprocess(
     for name, reason in absent.items():
         _skip(out, name, reason)
     due = {name: path for name, path in list(names.items())[index::count] if not (out / name / settings.mark).is_file()}
-    make = _make_scans if DATASETS[settings.kind].scans else _make_videos
-    done = 0
+    tasks = {name: (out / name, name, path, settings, progress) for name, path in due.items()}
+    load = functools.partial(FileBody.load, None if body.file == DEFAULT_BODY else body.file)
+    scans, done = DATASETS[settings.kind].scans, 0  # photos of videos are decoded by threads
     try:
-        for name, error in make(out, due, body, settings, workers, progress):
-            if error is None:
-                done += 1
-                (out / SKIPPED / f"{name}.json").unlink(missing_ok=True)
-            else:
-                _skip(out, name, str(error) or type(error).__name__)
+        with bar(total=len(due), desc="scans", shown=progress and scans) as shown:
+            for name, error in made(_make_scan if scans else _make_video, tasks, workers if scans else 1, load):
+                shown.update()
+                if error is None:
+                    done += 1
+                    (out / SKIPPED / f"{name}.json").unlink(missing_ok=True)
+                else:
+                    _skip(out, name, str(error) or type(error).__name__)
     finally:
-        manifest = _finish(out, [*names, *absent], settings)
+        manifest = _write_lists(out, [*names, *absent], settings)
     counts = manifest["counts"]
     if due and not counts["scenes"]:
         reason = next(iter(manifest["skipped"].values()), "nothing was made")
@@ -177,44 +166,13 @@ def preprocess(
 def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[str, str]]:
     data_set = DATASETS[settings.kind]
     if data_set.scans:
-        found = open_thuman(source)
-        return dict.fromkeys(found.names, source), dict(found.skipped)
+        names, skipped = open_thuman(source)
+        return dict.fromkeys(names, source), skipped
     folders = imported(data_set.find)(source)
     if not folders:
         raise CaptureError(source, "", f"no subject in the layout of {settings.kind} (docs/datasets.md)")
     named = lambda path: path.stem if path.is_file() else "_".join(path.relative_to(source).parts) or path.name
     return {named(path): path for path in folders}, {}
-
-
-Made = Iterator[tuple[str, Exception | None]]
-
-
-def _make_videos(out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool) -> Made:
-    """One after the other; photos are decoded by threads."""
-    for name, folder in due.items():
-        try:
-            subject = DATASETS[settings.kind](folder, body)
-            total = int((subject.frames % settings.every == 0).sum())
-            with bar(total=total, desc=name, unit="photo", shown=progress) as shown:
-                write_video(out / name, name, subject, body, settings, shown.update)
-        except (ValueError, ArithmeticError) as error:  # not OSError: a full disk ends everything
-            yield name, error
-        else:
-            yield name, None
-
-
-def _make_scans(out: Path, due: dict[str, Path], body: FileBody, settings: Settings, workers: int, progress: bool) -> Made:
-    """Several processes, which have one thread each."""
-    tasks = {name: (out / name, name, source, settings) for name, source in due.items()}
-    load = functools.partial(FileBody.load, None if body.file == DEFAULT_BODY else body.file)
-    with bar(total=len(due), desc="scans", shown=progress) as shown:
-        for name, error in made(_make_scan, tasks, workers, load):
-            shown.update()
-            yield name, error
-
-
-def _make_scan(body: FileBody, folder: Path, name: str, source: Path, settings: Settings) -> None:
-    write_scan(folder, name, ThumanSet(source, (name,), {}), body, settings)
 
 
 # Lists and manifest -----------------------------------------------------------------------------------------------------
@@ -227,17 +185,6 @@ def _made_with(settings: Settings) -> dict[str, Any]:
 def _skip(out: Path, name: str, reason: str) -> None:
     (out / SKIPPED).mkdir(exist_ok=True)
     write_json(out / SKIPPED / f"{name}.json", {"reason": reason})
-
-
-def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, Any]:
-    """Lists and manifest of what is there; again if other shards have added to it meanwhile."""
-    done, manifest = None, {}
-    for _ in range(2):  # not until nothing is added: that may be hours
-        if (found := finished(out, settings.mark)) != done:
-            done = found
-            scenes = {name: _read_scene(out / name / SCENE, settings) for name in done}
-            manifest = _write_lists(out, names, scenes, settings)
-    return manifest
 
 
 def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
@@ -255,7 +202,9 @@ def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
     return content
 
 
-def _write_lists(out: Path, names: Sequence[str], scenes: dict[str, dict[str, Any]], settings: Settings) -> dict[str, Any]:
+def _write_lists(out: Path, names: Sequence[str], settings: Settings) -> dict[str, Any]:
+    """Lists and manifest of what is there."""
+    scenes = {name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)}
     skipped = {
         file.stem: members(checked_json(file), file, reason=str)[0]
         for file in sorted((out / SKIPPED).glob("*.json"))
@@ -265,8 +214,8 @@ def _write_lists(out: Path, names: Sequence[str], scenes: dict[str, dict[str, An
     split = {"train": [name for name in train if name in scenes], "test": [name for name in test if name in scenes]}
     if settings.layout == "scenes":
         for part, chosen in split.items():
-            if chosen or part == "test":
-                write_list(out / f"{part}.json", [scenes[name]["entry"] for name in chosen])
+            if chosen or part == "test":  # compact: 2,300 scenes of 60 views are 50 MB
+                write_json(out / f"{part}.json", [scenes[name]["entry"] for name in chosen], indent=None)
         counts = {name: len(scenes[name]["entry"]["frames"]) for name in split["test"]}
         for inputs in INPUT_COUNTS:
             if counts and min(counts.values()) >= inputs + TARGETS:
@@ -285,84 +234,19 @@ def _write_lists(out: Path, names: Sequence[str], scenes: dict[str, dict[str, An
 # One scene ------------------------------------------------------------------------------------------------------------
 
 
-Tick = Callable[[], object]
+class View(NamedTuple):
+    """A photo to be written, None once it is. frame: which of the poses it shows. lengths are those of the scene."""
 
+    name: str
+    frame: int
+    K: Float[np.ndarray, "3 3"]
+    cam_from_world: Float[np.ndarray, "4 4"]
+    photo: Photo | None
 
-def write_scan(folder: Path, name: str, thuman: ThumanSet, body: FileBody, settings: Settings) -> None:
-    """A scan as the settings say. Raises: ValueError naming file and key."""
-    _write(folder, name, scan_content(name, thuman, body, settings), body, settings)
-
-
-def scan_content(name: str, thuman: ThumanSet, body: FileBody, settings: Settings) -> "Content":
-    """What is written of a scan; its views are rendered when they are asked for. Raises: ValueError naming file and key."""
-    fit = read_fit(thuman.fit_file(name), body)
-    fitted = fitted_body(fit, body)
-    mesh, faces = read_fit_mesh(fit.file.with_name(FIT_MESH))
-    error = fit_error(fitted, mesh, fit)
-    scan = read_scan(thuman.scan_file(name))
-    transform = scan_alignment(scan.vertices, fitted.joints[PELVIS], fitted.joints[NECK])
-    vertices = moved(transform, scan.vertices)
-    radius = bounding_radius(vertices)
-    number = int(name) if name.isdecimal() else zlib.crc32(os.fsencode(name))
-    cameras = scan_cameras(number, radius, settings.views, settings.factors)
-    renderer, K = ScanRenderer.of(scan, vertices), intrinsics(settings.size)
-
-    def views() -> Iterator[View]:
-        for i, pose in enumerate(cameras):
-            yield View(f"{i:03d}", 0, K, pose, *renderer.render(pose, settings.size, settings.supersample))
-
-    known = {
-        "fit_kind": fit.kind,
-        "fit_error_mm": [round(1e3 * each, 4) for each in error],
-        "units_per_metre": fit.scale,
-        "radius": radius,
-    }
-    posed = dataclasses.replace(fitted, vertices=mesh)
-    parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
-    return Content(transform, [posed], faces, parameters, fit.scale, views(), known)
-
-
-def write_video(folder: Path, name: str, subject: Subject, body: FileBody, settings: Settings, tick: Tick) -> None:
-    """Frames of a video from all cameras, `every` apart. tick: called after each photo. Raises: ValueError naming the file."""
-    chosen = np.flatnonzero(subject.frames % settings.every == 0)
-    if not len(chosen):
-        raise ValueError(f"{subject.name}: no photo of every {settings.every}th frame")
-    start = next(posed_people(body.model, subject.parameters([0])))
-    transform = video_alignment(start.vertices, start.joints[PELVIS], start.joints[NECK])
-    frames, shown = np.unique(subject.frames[chosen], return_inverse=True)
-    K, inverse = subject.squared_K(chosen, settings.size), np.linalg.inv(transform)
-    parameters = subject.parameters(frames.tolist())
-    known: dict[str, Any] = {"missing": dict(subject.missing), "unreadable": {}}
-
-    def views() -> Iterator[View]:
-        step = os.cpu_count() or 1
-        for first in range(0, len(chosen), step):
-            part = range(first, min(first + step, len(chosen)))
-            for i, photo in zip(part, _photos(subject, chosen[part], settings.size), strict=True):
-                tick()
-                view = int(chosen[i])
-                if isinstance(photo, Exception):
-                    known["unreadable"][subject.view_name(view)] = str(photo)
-                    continue
-                pose = subject.cam_from_world[view] @ inverse
-                yield View(subject.view_name(view), int(shown[i]), K[i], pose, *photo)
-
-    posed = posed_people(body.model, parameters)
-    content = Content(transform, posed, np.asarray(body.model.faces), parameters, 1.0, views(), known)
-    _write(folder, name, content, body, settings)
-
-
-def _photos(subject: Subject, views: Int[np.ndarray, " n"], size: int) -> list[Photo | Exception]:
-    import concurrent.futures
-
-    def photo(view):
-        try:
-            return subject.photo(int(view), size)
-        except (ValueError, OSError) as error:
-            return error
-
-    with concurrent.futures.ThreadPoolExecutor(len(views)) as pool:
-        return list(pool.map(photo, views))
+    @property
+    def files(self) -> tuple[str, str]:
+        """Of the photo and its mask."""
+        return f"images/{self.name}.png", f"masks/{self.name}.png"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -382,55 +266,116 @@ class Content:
     known: dict[str, Any]
 
 
-def _write(folder: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
-    write = _write_scene if settings.layout == "scenes" else _write_capture
-    replace_folder(folder, lambda temporary: write(temporary, folder, name, content, body, settings), mark=settings.mark)
+def _make_scan(body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool) -> None:
+    _write(folder, scan_content(source, name, body, settings), body, settings)
 
 
-def _write_images(folder: Path, view: View) -> tuple[str, ...]:
-    paths = tuple(f"{kind}/{view.name}.png" for kind in ("images", "masks"))
-    for path, pixels in zip(paths, (view.image, view.mask), strict=True):
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_png(folder / path, pixels / np.float32(255))
-    return paths
+def scan_content(source: Path, name: str, body: FileBody, settings: Settings) -> Content:
+    """What is written of a scan; its views are rendered when they are asked for. Raises: ValueError naming file and key."""
+    scan_file, fit_file = scan_files(source, name)
+    fit = read_fit(fit_file, body)
+    fitted = fitted_body(fit, body)
+    mesh, faces = read_fit_mesh(fit_file.with_name(FIT_MESH))
+    error = fit_error(fitted, mesh, fit)
+    scan = read_scan(scan_file)
+    transform = scan_alignment(scan.vertices, fitted.joints[PELVIS], fitted.joints[NECK])
+    vertices = moved(transform, scan.vertices)
+    radius = float(np.linalg.norm(vertices, axis=1).max())
+    number = int(name) if name.isdecimal() else zlib.crc32(os.fsencode(name))
+    cameras = scan_cameras(number, radius, settings.views, settings.factors)
+    renderer, K = ScanRenderer.of(scan, vertices), intrinsics(settings.size)
+    render = lambda pose: renderer.render(pose, settings.size, settings.supersample)
+    known = {
+        "fit_kind": fit.kind,
+        "fit_error_mm": [round(1e3 * each, 4) for each in error],
+        "units_per_metre": fit.scale,
+        "radius": radius,
+    }
+    views = (View(f"{i:03d}", 0, K, pose, render(pose)) for i, pose in enumerate(cameras))
+    posed = dataclasses.replace(fitted, vertices=mesh)
+    parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
+    return Content(transform, [posed], faces, parameters, fit.scale, views, known)
 
 
-def _write_scene(folder: Path, target: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
-    (folder / "smpl").mkdir(parents=True)
-    arrays = []
-    for posed in content.posed:
-        arrays.append(f"smpl/{len(arrays):06d}.npz")
+def _make_video(body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool) -> None:
+    """Frames of a video from all cameras, `every` apart."""
+    subject = DATASETS[settings.kind](source, body)
+    chosen = np.flatnonzero(subject.frames % settings.every == 0)
+    if not len(chosen):
+        raise ValueError(f"{subject.name}: no photo of every {settings.every}th frame")
+    start = next(posed_people(body.model, subject.parameters([0])))
+    transform = video_alignment(start.vertices, start.joints[PELVIS], start.joints[NECK])
+    frames, shown = np.unique(subject.frames[chosen], return_inverse=True)
+    K, inverse = subject.squared_K(chosen, settings.size), np.linalg.inv(transform)
+    parameters = subject.parameters(frames.tolist())
+    known: dict[str, Any] = {"missing": dict(subject.missing), "unreadable": {}}
+
+    def views() -> Iterator[View]:
+        step = os.cpu_count() or 1
+        with bar(total=len(chosen), desc=name, unit="photo", shown=progress) as done:
+            for first in range(0, len(chosen), step):
+                for i, photo in enumerate(subject.tried(chosen[first : first + step], settings.size), first):
+                    done.update()
+                    view = subject.view_name(int(chosen[i]))
+                    if isinstance(photo, Exception):
+                        known["unreadable"][view] = str(photo)
+                    else:
+                        yield View(view, int(shown[i]), K[i], subject.cam_from_world[chosen[i]] @ inverse, photo)
+
+    posed = posed_people(body.model, parameters)
+    content = Content(transform, posed, np.asarray(body.model.faces), parameters, 1.0, views(), known)
+    _write(folder, content, body, settings)
+
+
+def _write(folder: Path, content: Content, body: FileBody, settings: Settings) -> None:
+    """Photos and masks, then what the layout says of them."""
+
+    def write(temporary: Path) -> None:
+        for kind in ("images", "masks"):
+            (temporary / kind).mkdir(parents=True)
+        views = []
+        for view in content.views:
+            for path, pixels in zip(view.files, view.photo or (), strict=True):
+                write_png(temporary / path, pixels / np.float32(255))
+            views.append(view._replace(photo=None))
+        if not views:
+            raise ValueError(f"{folder.name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}")
+        known = {"views": len(views), "frames": len(content.parameters.rotations), **content.known}
+        described: dict[str, Any] = {"known": known}
+        if settings.layout == "scenes":
+            described = {"entry": _write_scene(temporary, folder.name, content, views)} | described
+        write_json(temporary / SCENE, described, indent=None)
+        if settings.layout == "capture":
+            _write_capture(temporary, folder, content, views, body)
+
+    replace_folder(folder, write, mark=settings.mark)
+
+
+def _write_scene(folder: Path, name: str, content: Content, views: Sequence[View]) -> dict[str, Any]:
+    """Writes the arrays of each frame; returns the entry for the list."""
+    (folder / "smpl").mkdir()
+    for i, posed in enumerate(content.posed):
         transforms = content.transform @ posed.joint_transforms
-        write_arrays(folder / arrays[-1], moved(content.transform, posed.vertices), posed.rest, content.faces, transforms)
+        vertices = moved(content.transform, posed.vertices)
+        write_arrays(folder / "smpl" / f"{i:06d}.npz", vertices, posed.rest, content.faces, transforms)
     frames = []
-    for view in content.views:
-        image, mask = _write_images(folder, view)
-        path = f"{target.name}/{arrays[view.frame]}"
-        frames.append(SceneFrame(f"{target.name}/{image}", view.cam_from_world, view.K, path, f"{target.name}/{mask}"))
-    if not frames:
-        raise ValueError(f"{name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}")
-    known = {"views": len(frames), "frames": len(arrays), **content.known}
-    entry = scene_entry(name, content.transform, frames)
-    write_json(folder / SCENE, {"entry": entry, "known": known}, indent=None)
+    for view in views:
+        image, arrays, mask = (f"{name}/{path}" for path in (view.files[0], f"smpl/{view.frame:06d}.npz", view.files[1]))
+        frames.append(SceneFrame(image, view.cam_from_world, view.K, arrays, mask))
+    return scene_entry(name, content.transform, frames)
 
 
-def _write_capture(folder: Path, target: Path, name: str, content: Content, body: FileBody, settings: Settings) -> None:
+def _write_capture(folder: Path, target: Path, content: Content, views: Sequence[View], body: FileBody) -> None:
     """In metres; the poses are those of the aligned world."""
-    folder.mkdir()
     matrix = content.transform.copy()
     matrix[:3, 3] /= content.scale
     pelvis = body.rest_joints(content.parameters.betas)[0]
     betas, rotations, translations = turned(content.parameters, matrix, pelvis)
+    write_npz(folder / "body.npz", parameter_arrays(target, body.model, body.file, betas, rotations, translations))
     described = []
-    for view in content.views:
-        image, mask = _write_images(folder, view)
+    for view in views:
         pose = view.cam_from_world.copy()
         pose[:3, 3] /= content.scale
-        matrices = {"K": view.K.tolist(), "cam_from_world": pose.tolist()}
-        described.append({"image": image, "mask": mask, "frame": view.frame, **matrices})
-    if not described:
-        raise ValueError(f"{name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}")
-    write_npz(folder / "body.npz", parameter_arrays(target, body.model, body.file, betas, rotations, translations))
-    known = {"views": len(described), "frames": len(rotations), **content.known}
-    write_json(folder / SCENE, {"known": known}, indent=None)
+        files = dict(zip(("image", "mask"), view.files, strict=True))
+        described.append({**files, "frame": view.frame, "K": view.K.tolist(), "cam_from_world": pose.tolist()})
     write_description(folder, described, "white")

@@ -29,10 +29,10 @@ def body(tmp_path_factory):
 
 def read_thuman(folder, body):
     """All that preprocessing reads and computes before it renders."""
-    thuman = open_thuman(folder)
-    for name in thuman.names:
-        scan_content(name, thuman, body, Settings("thuman", views=1))
-    return thuman.skipped
+    names, skipped = open_thuman(folder)
+    for name in names:
+        scan_content(folder, name, body, Settings("thuman", views=1))
+    return skipped
 
 
 def read_people(folder, body):
@@ -209,9 +209,9 @@ thuman("left and right hands exchanged", swapped_pkl(FIT, "left_hand_pose", "rig
 thuman("no fitted mesh", removed(MESH), OBJ, "no such file")
 thuman("a mesh of another model", text(MESH, "v ", "v 0 0 0\nv "), OBJ, "81 vertices")
 thuman("a mesh in other units", scaled_obj(MESH, 1000), OBJ, "mm from this mesh")
-thuman("text in a vertex", text(MESH, "v ", "v x y z\nv "), OBJ, "line 1")
+thuman("text in a vertex", text(MESH, "v ", "v x y z\nv "), OBJ, "could not convert")
 thuman("a NaN in a vertex", text(MESH, "v ", "v nan 0 0\nv "), OBJ, "finite")
-thuman("a face of vertices that are not there", text(MESH, "f ", "f 1 2 900\nf "), OBJ, "900")
+thuman("a face of vertices that are not there", text(MESH, "f ", "f 1 2 900\nf "), OBJ, "f: expected integers in [0, 80)")
 thuman("no texture", removed("model/0001/material0.jpeg"), "0001.obj", "texture")
 thuman("no material", removed("model/0001/material0.mtl"), "0001.obj", "texture")
 thuman(
@@ -231,11 +231,11 @@ scenes("no frames", jsn(LIST, lambda c: c[0].pop("frames")), LIST, "s0.frames")
 scenes("no views", jsn(LIST, lambda c: c[0].update(frames=[])), LIST, "s0.frames")
 scenes("no name", jsn(LIST, lambda c: c[0].pop("scene_name")), LIST, "scene_name")
 scenes("two scenes of one name", jsn(LIST, lambda c: c.append(c[0])), LIST, "[1].scene_name")
-scenes("a number for a path", frame(lambda f: f.update(image_path=3)), LIST, "image_path", "path of a file")
+scenes("a number for a path", frame(lambda f: f.update(image_path=3)), LIST, "image_path", "name or path")
 scenes("a path that leads out", frame(lambda f: f.update(image_path="../../x.png")), LIST, "outside")
 scenes("arrays that lead out", frame(lambda f: f.update(smpl_path="/etc/hostname")), LIST, "outside")
 scenes("w2c of 3 rows", frame(lambda f: f.update(w2c=f["w2c"][:3])), LIST, "w2c", "(3, 4)")
-scenes("ragged w2c", frame(lambda f: f["w2c"][1].pop()), LIST, "w2c", "rows")
+scenes("ragged w2c", frame(lambda f: f["w2c"][1].pop()), LIST, "w2c", "numbers")
 scenes("a NaN in w2c", frame(lambda f: f["w2c"][0].__setitem__(0, float("nan"))), LIST, "w2c", "finite")
 scenes(
     "a mirrored w2c",
@@ -256,7 +256,13 @@ scenes("v_cano of another model", npz(ARRAYS, v_cano=lambda x: x[:-1]), "0.npz",
 scenes("v_cano of somebody else", npz(ARRAYS, v_cano=lambda x: x[::-1]), "0.npz", "v_cano", "mm from body")
 scenes("v_posed for v_cano", swapped_npz(ARRAYS, "v_cano", "v_posed"), "0.npz", "v_cano", "mm from body")
 scenes("a NaN in v_cano", npz(ARRAYS, v_cano=spoiled(np.nan)), "0.npz", "v_cano", "finite")
-scenes("joints that are no rotation", npz(ARRAYS, joint_transforms=lambda x: 2 * x), "0.npz", "joint_transforms", "no rotation")
+scenes(
+    "joints that are no rotation",
+    npz(ARRAYS, joint_transforms=lambda x: 2 * x),
+    "0.npz",
+    "joint_transforms",
+    "expected rotations",
+)
 scenes("54 joints", npz(ARRAYS, joint_transforms=lambda x: x[1:]), "0.npz", "joint_transforms", "(54, 4, 4)")
 
 
@@ -307,8 +313,8 @@ dna(
     "array_bytes",
 )
 dna("K of 2 rows", h5_set("Camera_Parameter/00/K", lambda x: x[:2]), "Camera_Parameter/00/K", "(2, 3)")
-dna("a scaled RT", h5_set("Camera_Parameter/00/RT", lambda x: 2 * x), "Camera_Parameter/00/RT", "scaled")
-dna("a mirrored RT", h5_set("Camera_Parameter/00/RT", lambda x: -x), "Camera_Parameter/00/RT", "mirrored")
+dna("a scaled RT", h5_set("Camera_Parameter/00/RT", lambda x: 2 * x), "annots.smc: 00", "scaled")
+dna("a mirrored RT", h5_set("Camera_Parameter/00/RT", lambda x: x @ np.diag([1, 1, -1, 1])), "annots.smc: 00", "mirrored")
 dna(
     "RT in millimetres",
     h5_set("Camera_Parameter/00/RT", lambda x: np.block([[x[:, :3], 1000 * x[:, 3:] - [[0], [0], [0], [999]]]])),

@@ -81,9 +81,9 @@ def test_evaluation_indices_are_those_of_pythons_seed_777():
 def test_preprocessing_reproduces_the_published_arrays(tmp_path):
     """By an independent computation: SMPL-X's equations joint by joint, the protocol's steps one after the other."""
     arrays, body = model_arrays(), write_model(tmp_path)
-    thuman = open_thuman(write_thuman(tmp_path / "thuman", arrays))
-    for i, (name, kind) in enumerate(zip(thuman.names, "ABC", strict=True)):
-        content = scan_content(name, thuman, body, Settings("thuman"))
+    folder = write_thuman(tmp_path / "thuman", arrays)
+    for i, (name, kind) in enumerate(zip(open_thuman(folder)[0], "ABC", strict=True)):
+        content = scan_content(folder, name, body, Settings("thuman"))
         assert content.known["fit_kind"] == kind and content.known["fit_error_mm"][1] < 0.01
         rest, mesh, transforms = scan_vertices(arrays, fit_values(kind, i))
         # T: the middle of the raw scan's bounding box, here that of the mesh; R: pelvis -> neck upright
@@ -111,10 +111,10 @@ def test_preprocessing_reproduces_the_published_arrays(tmp_path):
 
 def test_another_body_or_another_kind_of_fit_is_noticed_by_its_mesh(tmp_path):
     arrays = model_arrays()
-    thuman = open_thuman(write_thuman(tmp_path / "thuman", arrays))
+    folder = write_thuman(tmp_path / "thuman", arrays)
     (tmp_path / "other").mkdir()
     other = write_model(tmp_path / "other", seed=1)
     with pytest.raises(ValueError, match=r"mesh_smplx.obj: the fit \(kind A\) is .* mm from this mesh on average.*male"):
-        scan_content("0000", thuman, other, Settings("thuman"))
+        scan_content(folder, "0000", other, Settings("thuman"))
     with pytest.raises(ValueError, match=r"kind C.*neutral"):
-        scan_content("0002", thuman, other, Settings("thuman"))
+        scan_content(folder, "0002", other, Settings("thuman"))

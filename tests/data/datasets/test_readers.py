@@ -169,8 +169,8 @@ def test_evaluation_indices_are_read_and_checked(tmp_path):
 def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
     folder = write_thuman(tmp_path / "t", model_arrays())
     (folder / "smplx" / "0001" / "smplx_param.pkl").unlink()
-    found = open_thuman(folder)
-    assert found.names == ("0000", "0002") and "smplx_param.pkl: no such file" in found.skipped["0001"]
+    names, skipped = open_thuman(folder)
+    assert names == ["0000", "0002"] and "smplx_param.pkl: no such file" in skipped["0001"]
     with pytest.raises(ValueError, match="preprocess thuman"):
         open_people(folder, FileBody.load())
     (person,) = open_people(write_avatarrex(tmp_path / "a"), FileBody.load())
