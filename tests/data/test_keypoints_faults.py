@@ -51,15 +51,15 @@ def test_frames_that_were_matched_in_order_are_told(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps(content))
     keypoints = read_keypoints(tmp_path / "k.json", [f"clip_{i + 1:06d}" for i in range(3)], *SIZE)
     assert keypoints.points[:, 0, 0].tolist() == [100.5, 101.5, 102.5] and keypoints.missing == ()
-    assert keypoints.shifted == "clip_000000000000 is view clip_000001"
-    assert read(tmp_path / "k.json", [entry("front"), entry("back")]).shifted == ""
+    assert keypoints.warnings[0].endswith("matched in order: clip_000000000000 is view clip_000001")
+    assert read(tmp_path / "k.json", [entry("front"), entry("back")]).warnings == ()
 
 
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, None])
 def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path, index, value):
     keypoints = read(tmp_path / "k.json", [with_number(index, value)])
-    assert keypoints.not_finite == 1 and np.isfinite(keypoints.points).all()
+    assert "1 keypoints are not finite numbers" in keypoints.warnings[1] and np.isfinite(keypoints.points).all()
     assert keypoints.confidences[0, 0] == 0 and (keypoints.confidences[0, 1:] == 0.75).all()
 
 
@@ -86,7 +86,8 @@ def test_scores_of_another_scale_are_divided_by_the_largest_of_the_file_and_it_i
 )
 def test_points_half_an_image_outside_are_dropped_and_counted(tmp_path, index, value, kept):
     keypoints = read(tmp_path / "k.json", [with_number(index, value)])
-    assert (keypoints.confidences[0, 0] > 0) == kept and keypoints.far_outside == (not kept)
+    assert (keypoints.confidences[0, 0] > 0) == kept
+    assert any(line.startswith("1 keypoints lie far outside") for line in keypoints.warnings) == (not kept)
     assert keypoints.points[0, 0, index] == value + 0.5
 
 
@@ -173,13 +174,13 @@ FAULTS = {
     "unknown image": (annotations(image_id=4), r"annotations\[0\]\.image_id: expected the id of one of the images, got 4"),
     "visibility": (annotations(keypoints=[9.0, 9.0, 3.0] * 17), r"expected visibilities 0, 1 or 2, got 3"),
     "no images": ({"annotations": []}, r"images: missing"),
-    "scores": ([{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}], r"keypoint_scores: expected one for each of 17"),
-    "flat instance": ([{"keypoints": [1.0] * 34, "keypoint_scores": [1.0] * 17}], r"expected x and y of each point"),
+    "scores": ([{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}], r"keypoint_scores: expected shape \(17,\), got \(1,\)"),
+    "flat instance": ([{"keypoints": [1.0] * 34, "keypoint_scores": [1.0] * 17}], r"keypoints: expected shape \(any, 2\)"),
     "frame": ([{"frame_id": "a", "instances": []}], r"\[0\]\.frame_id: expected an integer, got 'a'"),
     "no instances": ([{"frame_id": 0}], r"\[0\]\.instances: missing"),
     "openpose coco": (
         {"people": [{"pose_keypoints_2d": [1.0] * 54}]},
-        r"people\[0\]\.pose_keypoints_2d: the 18 points of the model COCO: expected BODY_25",
+        r"people\[0\]\.pose_keypoints_2d: expected a flat list of 75 ",
     ),
     "openpose hand": (
         {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": [1.0] * 60}]},

@@ -120,21 +120,16 @@ class ImagePeople:
 
 def seen_person(person: DetectedPerson) -> SeenPerson:
     """What of a detected person is written."""
-    points = np.concatenate([person.pixels, person.visibility[:, None]], axis=1)
+    points = np.column_stack([person.pixels, person.visibility])
     return SeenPerson(np.asarray(points, np.float64), person.world, person.presence)
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
     """Write the file, whole or not at all."""
-    described = [
-        {
-            "image": image.image,
-            "width": image.size[0],
-            "height": image.size[1],
-            "people": [None if person is None else _described(person) for person in image.people],
-        }
-        for image in images
-    ]
+    described = []
+    for image in images:
+        people = [None if person is None else _described(person) for person in image.people]
+        described.append({"image": image.image, "width": image.size[0], "height": image.size[1], "people": people})
     write_json(path, {"format": FORMAT, "version": VERSION, "set": MEDIAPIPE_33.name, "images": described}, indent=None)
 
 
@@ -181,7 +176,7 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
         file_numbers(value, path, f"{field}.{key}", shape, nulls=True)
         for value, (key, shape) in zip(values, shapes.items(), strict=False)
     )
-    return SeenPerson(np.concatenate([pixels, visibility[:, None]], axis=1), world, float(values[-1]))
+    return SeenPerson(np.column_stack([pixels, visibility]), world, float(values[-1]))
 
 
 # OpenPose's --write_json -----------------------------------------------------------------------------------------------
@@ -190,8 +185,6 @@ SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
 OPENPOSE_PARTS = {"pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
 """The face, if it is there, is not read."""
-OTHER_MODELS = {18: "COCO", 15: "MPI", 135: "BODY_135"}
-"""By their number of points."""
 
 
 def recognizes_openpose(source: Source) -> bool:
@@ -202,35 +195,25 @@ def recognizes_openpose(source: Source) -> bool:
 def read_openpose(source: Source, format: SourceFormat) -> Detections:
     """The people of one image. Raises: CaptureError."""
     (entries,) = members(source.json, source.path, people=list)
-    people = [_openpose_person(entry, source.path, f"people[{i}]") for i, entry in enumerate(entries)]
-    kind = next((SETS_BY_COUNT[len(each)] for each in people if len(each) in SETS_BY_COUNT), OPENPOSE_67)
-    if odd := [i for i, each in enumerate(people) if len(each) != len(kind.names)]:
-        raise CaptureError(source.path, f"people[{odd[0]}]", f"not of the {kind.name} points of another person")
-    image = DetectedImage(source.name.removesuffix(SUFFIX), source.path, tuple(people))
-    return Detections(kind if people else None, (image,))
+    people = tuple(_openpose_person(entry, source.path, f"people[{i}]") for i, entry in enumerate(entries))
+    return detections_of([DetectedImage(source.name.removesuffix(SUFFIX), source.path, people)], OPENPOSE_67)
 
 
 def _openpose_person(person: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:
     (body,) = members(person, file, field, pose_keypoints_2d=list)
     if len(body) % 3 == 0 and len(body) // 3 in SETS_BY_COUNT:
         return triples(body, file, f"{field}.pose_keypoints_2d")
-    return np.concatenate([_part(person.get(key, []), file, f"{field}.{key}", n) for key, n in OPENPOSE_PARTS.items()])
-
-
-def _part(values: Any, file: Path, field: str, count: int) -> Float[np.ndarray, "k 3"]:
-    """The points of the body or of a hand; an empty list means that it was not detected."""
-    if not expect(values, list, file, field):
-        return np.zeros((count, 3))
-    found = len(values) // 3
-    if count != 21 and found in OTHER_MODELS:
-        problem = f"the {found} points of the model {OTHER_MODELS[found]}: expected BODY_25 (--model_pose BODY_25)"
-        raise CaptureError(file, field, problem)
-    return triples(values, file, field, count)
+    # an empty list means that the part was not detected; older versions leave it out
+    parts = [
+        triples(person[key], file, f"{field}.{key}", count) if person.get(key) else np.zeros((count, 3))
+        for key, count in OPENPOSE_PARTS.items()
+    ]
+    return np.concatenate(parts)
 
 
 # EasyMocap's annots ----------------------------------------------------------------------------------------------------
 
-EASYMOCAP_PARTS = {"keypoints": 25, "handl2d": 21, "handr2d": 21}
+EASYMOCAP_HANDS = ("handl2d", "handr2d")
 MOST_PEOPLE = 64
 """People are in the order of their IDs; beyond this many an ID is no count."""
 
@@ -246,18 +229,10 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
         members(entry, file, field, keypoints=list)
-        parts = {
-            key: file_numbers(entry[key], file, f"{field}.{key}", (None, 3), nulls=True)
-            for key in EASYMOCAP_PARTS
-            if entry.get(key)
-        }
-        if len(parts.get("keypoints", ())) == EASYMOCAP_PARTS["keypoints"]:
-            parts = {key: parts.get(key, np.zeros((count, 3))) for key, count in EASYMOCAP_PARTS.items()}
-            if wrong := [key for key, count in EASYMOCAP_PARTS.items() if len(parts[key]) != count]:
-                raise CaptureError(file, f"{field}.{wrong[0]}", f"expected {EASYMOCAP_PARTS[wrong[0]]} points")
-            person = np.concatenate(list(parts.values()))
-        else:
-            person = parts.get("keypoints", np.zeros((0, 3)))
+        numbers = lambda key, field=field, entry=entry: file_numbers(entry[key], file, f"{field}.{key}", (None, 3), nulls=True)
+        person = numbers("keypoints") if entry["keypoints"] else np.zeros((0, 3))
+        if len(person) == 25:  # BODY_25, perhaps with hands
+            person = np.concatenate([person, *(numbers(key) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS)])
         number = entry.get("personID", i)
         people[number if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people else len(people)] = person
     first = next(iter(people.values()), np.zeros((0, 3)))
@@ -265,7 +240,7 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
     name, size = content.get("filename"), (content.get("width"), content.get("height"))
     known = all(type(side) is int and side > 0 for side in size)
     image = DetectedImage(name if isinstance(name, str) and name else source.name, file, found, size if known else None)
-    return Detections(OPENPOSE_67, (image,)) if len(first) == len(OPENPOSE_67.names) else detections_of([image])
+    return detections_of([image], OPENPOSE_67)
 
 
 # COCO ------------------------------------------------------------------------------------------------------------------
@@ -351,7 +326,7 @@ def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> 
     if not np.isnan(visibility).all() and (np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY):
         raise CaptureError(file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}")
     confidence = np.where(visibility == 1, HIDDEN_CONFIDENCE, np.where(visibility > 0, 1.0, 0.0))
-    return np.concatenate([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)[:, None]], axis=1)
+    return np.column_stack([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)])
 
 
 def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
@@ -401,11 +376,6 @@ def _people(instances: list[Any], file: Path, field: str) -> tuple[Float[np.ndar
 
 def _mmpose_person(instance: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:
     points, scores = members(instance, file, field, keypoints=list, keypoint_scores=list)
-    points = file_numbers(points, file, f"{field}.keypoints", nulls=True)
-    scores = file_numbers(scores, file, f"{field}.keypoint_scores", nulls=True)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise CaptureError(file, f"{field}.keypoints", f"expected x and y of each point, got shape {points.shape}")
-    if scores.shape != points.shape[:1]:
-        problem = f"expected one for each of {len(points)} keypoints, got shape {scores.shape}"
-        raise CaptureError(file, f"{field}.keypoint_scores", problem)
-    return np.concatenate([points, scores[:, None]], axis=1)
+    points = file_numbers(points, file, f"{field}.keypoints", (None, 2), nulls=True)
+    scores = file_numbers(scores, file, f"{field}.keypoint_scores", (len(points),), nulls=True)
+    return np.column_stack([points, scores])

@@ -168,8 +168,6 @@ SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOL
 
 # Keypoints -------------------------------------------------------------------------------------------------------------
 
-LISTED = 5
-"""Names of views in a warning, at most."""
 HALF_PIXEL = 0.5
 """Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
 
@@ -183,40 +181,15 @@ class Keypoints:
     confidences: (v, k) float32 in [0, 1]; 0: the point is missing.
     set: what the k points are. world: (v, k, 3) metres, where the detector has said it: a person of average size, in axes whose z
         is the ray to the person, up to a translation. missing: names of the views that the file has nothing for.
-    not_finite: points that were NaN or infinite in the file. far_outside: points more than half an image outside of it.
-        Both kinds have confidence 0.
-    shifted: an image and its view, where they are counted from different numbers and were matched in order; else "".
+    warnings: problems of a file that could be read, a line each.
     """
 
     points: Float[np.ndarray, "v k 2"]
     confidences: Float[np.ndarray, "v k"]
     set: KeypointSet
     missing: tuple[str, ...] = ()
-    not_finite: int = 0
-    far_outside: int = 0
-    shifted: str = ""
-    largest: float = 1.0
-    """Of the scores of the file, by which they were divided; 1 where they were in [0, 1]."""
     world: Float[np.ndarray, "v k 3"] | None = None
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Problems of a keypoint file that could be read, a line each."""
-        found = []
-        if self.missing:
-            names = ", ".join(self.missing[:LISTED]) + (" ..." if len(self.missing) > LISTED else "")
-            found.append(f"no keypoints of {len(self.missing)} views: {names}")
-        if self.shifted:
-            found.append(f"frames and photos are counted from different numbers and were matched in order: {self.shifted}")
-        if self.largest > 1:
-            found.append(f"scores of up to {self.largest:.4g}, of another scale than [0, 1]: divided by that")
-        if self.not_finite:
-            found.append(f"{self.not_finite} keypoints are not finite numbers and are ignored")
-        if self.far_outside:
-            found.append(
-                f"{self.far_outside} keypoints lie far outside of their photo and are ignored: of photos of another size?"
-            )
-        return tuple(found)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,17 +237,23 @@ class Source:
         return None if self.path.suffix.lower() in KEYPOINTS.suffixes else checked_json(self.path)
 
 
-def detections_of(images: Sequence[DetectedImage]) -> Detections:
-    """Images of people whose set is told by the number of their points. Raises: CaptureError for others, and for two sets."""
+def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
+    """Images of people whose set is told by the number of their points. more: sets beside `SETS_BY_COUNT`.
+
+    Raises: CaptureError for other numbers, and for two sets.
+    """
     people = [(len(person), image) for image in images for person in image.people]
-    for count, image in people:
-        if count != people[0][0]:
-            problem = f"a person of {count} points, but another has {people[0][0]}: expected one set of keypoints"
+    if not people:
+        return Detections(None, tuple(images))
+    known, (count, first) = SETS_BY_COUNT | {len(each.names): each for each in more}, people[0]
+    for other, image in people:
+        if other != count:
+            problem = f"a person of {other} points, but another has {count}: expected one set of keypoints"
             raise CaptureError(image.file, f"image {image.image}", problem)
-    if people and people[0][0] not in SETS_BY_COUNT:
-        known = " or ".join(f"{count} ({each.name})" for count, each in SETS_BY_COUNT.items())
-        raise CaptureError(people[0][1].file, "keypoints", f"expected {known} points, got {people[0][0]}")
-    return Detections(SETS_BY_COUNT[people[0][0]] if people else None, tuple(images))
+    if count not in known:
+        counts = " or ".join(f"{number} ({each.name})" for number, each in known.items())
+        raise CaptureError(first.file, "keypoints", f"expected {counts} points, got {count}")
+    return Detections(known[count], tuple(images))
 
 
 def triples(value: Any, file: Path, field: str, count: int | None = None) -> Float[np.ndarray, "k 3"]:

@@ -1,10 +1,11 @@
 """Keypoints of a capture's views: from a detector's file, the image of each view and the one person in it."""
 
+import collections
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,16 +32,6 @@ FAR_OUTSIDE = 0.5
 LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
-
-
-class Person(NamedTuple):
-    """values: (k, 3) pixels with centres at +0.5, finite, and confidences in [0, 1], or (k, 6) with `Keypoints.world`. Counts as
-    there.
-    """
-
-    values: Float[np.ndarray, "k columns"]
-    not_finite: int = 0
-    far_outside: int = 0
 
 
 def read_detections(path: Path) -> Detections:
@@ -118,38 +109,49 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
     if (kind := detections.set) is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
+    scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
+    largest = float(scores[np.isfinite(scores)].max(initial=0.0))
+    largest = largest if largest > OVERSHOOT else 1.0
     body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
-    largest = _largest_score(detections)
-    columns = max((each.shape[1] for image in detections.images for each in image.people), default=3)
-    people, most, nobody = [], 0, Person(np.zeros((len(kind.names), columns)))
-    for image, name in zip(images, names, strict=True):
-        seen = () if image is None else image.people
-        found = [_usable(each, largest, detections.offset, width, height, image, name) for each in seen if image is not None]
-        most = max(most, len(found))
-        if image is not None and person is None and (clear := sum(_is_clear(each.values[body, 2]) for each in found)) > 1:
+    columns = max(each.shape[1] for image in detections.images for each in image.people)
+    raw, values = np.zeros((2, len(names), len(kind.names), columns))
+    most = 0
+    for view, (image, name) in enumerate(zip(images, names, strict=True)):
+        if image is None or not image.people:
+            continue
+        people = np.stack(image.people)
+        usable = _usable(people, largest, detections.offset, (width, height), image.file, name)
+        clear = sum(map(_is_clear, usable[:, body, 2]))
+        if person is None and clear > 1:
             choice = "Person I is the I-th of each view, counted from 0 in the order of the file"
             problem = f"{clear} people: expected one. {choice}; or crop the photos, or delete the others from the file"
             raise CaptureError(image.file, f"view {name}", problem)
-        if person is not None:
-            people.append(found[person] if person < len(found) else nobody)
-        else:
-            people.append(max(found, key=lambda each: each.values[:, 2].sum(), default=nobody))
+        which = int(usable[..., 2].sum(axis=1).argmax()) if person is None else person
+        if which < len(people):
+            raw[view], values[view] = people[which], usable[which]
+        most = max(most, len(people))
     if person is not None and person >= most:
         raise CaptureError(path, f"person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}")
-    values = np.stack([each.values for each in people]).astype(np.float32)
-    keypoints = Keypoints(
-        values[..., :2],
-        values[..., 2],
-        kind,
-        missing=tuple(name for name, row in zip(names, values[..., 2], strict=True) if not row.any()),
-        not_finite=sum(each.not_finite for each in people),
-        far_outside=sum(each.far_outside for each in people),
-        shifted=_shifted(images, names),
-        largest=largest,
-        world=values[..., 3:] if columns > 3 else None,
+    points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
+    missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
+    finite = np.isfinite(raw).all(axis=-1)
+    dropped, far = int((~finite).sum()), int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum())
+    if not confidences.any():
+        problem = f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos: {far})"
+        raise CaptureError(path, "", f"{problem}: expected keypoints of these photos")
+    if np.abs(points[confidences > 0]).max() < NORMALIZED:
+        problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
+        raise CaptureError(path, "", f"{problem} (OpenPose: --keypoint_scale 0)")
+    shifted = _shifted(images, names)
+    lines = (
+        (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
+        (shifted, f"frames and photos are counted from different numbers and were matched in order: {shifted}"),
+        (largest > 1, f"scores of up to {largest:.4g}, of another scale than [0, 1]: divided by that"),
+        (dropped, f"{dropped} keypoints are not finite numbers and are ignored"),
+        (far, f"{far} keypoints lie far outside of their photo and are ignored: of photos of another size?"),
     )
-    _check_pixels(path, keypoints)
-    return keypoints
+    world = values[..., 3:].astype(np.float32) if columns > 3 else None
+    return Keypoints(points, confidences, kind, missing, world, tuple(line for found, line in lines if found))
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
@@ -189,16 +191,6 @@ def _images_of_views(
     return images
 
 
-def _check_pixels(path: Path, keypoints: Keypoints) -> None:
-    seen = keypoints.points[keypoints.confidences > 0]
-    if not len(seen):
-        problem = f"no point has a confidence above 0 (not finite: {keypoints.not_finite}, far outside of the photos: "
-        raise CaptureError(path, "", f"{problem}{keypoints.far_outside}): expected keypoints of these photos")
-    if np.abs(seen).max() < NORMALIZED:
-        problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
-        raise CaptureError(path, "", f"{problem} (OpenPose: --keypoint_scale 0)")
-
-
 # Which person ---------------------------------------------------------------------------------------------------------
 
 
@@ -207,34 +199,20 @@ def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
     return len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
 
 
-def _largest_score(detections: Detections) -> float:
-    """Of all people, if it is beyond what heat maps overshoot; else 1."""
-    scores = [person[:, 2] for image in detections.images for person in image.people if len(person)]
-    known = np.concatenate(scores) if scores else np.zeros(0)
-    largest = float(known[np.isfinite(known)].max(initial=0.0))
-    return largest if largest > OVERSHOOT else 1.0
-
-
 def _usable(
-    values: Float[np.ndarray, "k columns"],
-    largest: float,
-    offset: float,
-    width: int,
-    height: int,
-    image: DetectedImage,
-    view: str,
-) -> Person:
-    """Raises: CaptureError if confidences are not in [0, 1]."""
-    finite = np.logical_and.reduce(np.isfinite(values), axis=1)
-    known = values[np.isfinite(values[:, 2]), 2]
+    people: Float[np.ndarray, "p k columns"], largest: float, offset: float, size: tuple[int, int], file: Path, view: str
+) -> Float[np.ndarray, "p k columns"]:
+    """Pixels with centres at +0.5, finite, and confidences in [0, 1], 0 for points that cannot be used."""
+    finite = np.logical_and.reduce(np.isfinite(people), axis=-1)
+    known = people[np.isfinite(people[..., 2]), 2]
     if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_SCORE):
         got = f"{known.min():.4g} to {known.max():.4g}"
-        raise CaptureError(image.file, f"view {view}", f"expected confidences in [0, 1], got {got}")
-    values = np.where(finite[:, None], np.clip(values, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
-    points, confidences = values[:, :2] + offset, np.clip(values[:, 2] / largest, 0, 1)
-    far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
-    usable = np.column_stack([points, np.where(far, 0, confidences), values[:, 3:]])
-    return Person(usable, int((~finite).sum()), int(far.sum()))
+        raise CaptureError(file, f"view {view}", f"expected confidences in [0, 1], got {got}")
+    values = np.where(finite[..., None], np.clip(people, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
+    values[..., :2] += offset
+    near = (np.abs(values[..., :2] / size - 0.5) <= 0.5 + FAR_OUTSIDE).all(axis=-1)
+    values[..., 2] = np.where(near, np.clip(values[..., 2] / largest, 0, 1), 0)
+    return values
 
 
 # Which view -----------------------------------------------------------------------------------------------------------
@@ -252,38 +230,62 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
-    numbered = _match_numbers([image for image in images if isinstance(image, int)], names)
-    named = _match_paths([image for image in images if isinstance(image, str)], names)
-    views = [numbered.get(image) if isinstance(image, int) else named[image] for image in images]
-    owner: dict[int, str | int] = {}
-    for image, view in zip(images, views, strict=True):
-        if view is None:
+    find = _finder(names)
+    found = {image: find(image) for image in images}
+    for image, views in found.items():
+        if len(views) > 1:
+            both = " and ".join(repr(names[view]) for view in views[:2])
+            raise ValueError(f"image number {image} could be view {both}: expected file names instead of numbers")
+    videos: dict[str | None, list[tuple[int, str | int]]] = {}
+    for image in found:
+        prefix, number = (None, image) if isinstance(image, int) else _split_number(str(_stem(image)))
+        if number is not None:
+            videos.setdefault(prefix, []).append((number, image))
+    of_view = [_split_number(name)[0] for name in names]
+    for prefix, frames in videos.items():
+        numbers = sorted(number for number, _ in frames)
+        if numbers[0] > 1 or len(numbers) < 2 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
             continue
+        shift = 1 - 2 * numbers[0]
+        moved = {image: find(n + shift if prefix is None else f"{prefix}{n + shift}") for n, image in frames}
+        prefixes = {of_view[view] for views in moved.values() for view in views}
+        all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1
+        if all_of_one and sum(each in prefixes for each in of_view) == len(frames):
+            found |= moved
+    owner: dict[int, str | int] = {}
+    matched = [found[image][0] if found[image] else None for image in images]
+    for image, view in zip(images, matched, strict=True):
         if view in owner:
             raise ValueError(f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view")
-        owner[view] = image
-    return views
+        if view is not None:
+            owner[view] = image
+    return matched
 
 
-def _match_paths(images: Sequence[str], names: Sequence[str]) -> dict[str, int | None]:
-    views = {image: _match_path(_stem(image), names) for image in images}
-    videos: dict[str, list[tuple[int, str]]] = {}
-    for image in views:
-        video, number = _split_number(str(_stem(image)))
-        if number is not None:
-            videos.setdefault(video, []).append((number, image))
-    of_view = [_split_number(name) for name in names]
-    for video, frames in videos.items():
-        frames.sort()
-        first, count = frames[0][0], len(frames)
-        counted = [number for number, _ in frames] == list(range(first, first + count))
-        if first > 1 or count < 2 or not counted or None not in (views[image] for _, image in frames):
-            continue
-        shifted = [_match_path(PurePosixPath(f"{video}{1 - first + i}"), names) for i in range(count)]
-        prefixes = {of_view[view][0] for view in shifted if view is not None}
-        if None not in shifted and len(prefixes) == 1 and sum(prefix in prefixes for prefix, _ in of_view) == count:
-            views |= {image: view for (_, image), view in zip(frames, shifted, strict=True)}
-    return views
+def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
+    """A function that finds the view of an image, or none; of a number it may find several."""
+    exact = {name: [i] for i, name in enumerate(names)}
+    plain, ends, numbers = (collections.defaultdict(list) for _ in range(3))
+    for i, name in enumerate(names):
+        plain[_plain(name)].append(i)
+        for underscore in re.finditer("_", _plain(name)):
+            ends[_plain(name)[underscore.end() :]].append(i)
+        if found := re.findall(r"\d+", name):
+            numbers[int(found[-1])].append(i)
+
+    def find(image: str | int) -> list[int]:
+        if isinstance(image, int):
+            return numbers.get(image, [])
+        parts = _stem(image).parts
+        # the names of views are made from paths in this way; with as many of the folders as fit, then numbers as numbers
+        keys = [re.sub(r"[^\w.-]", "_", "_".join(parts[i:])).lstrip("._") for i in range(len(parts))]
+        for key in keys:
+            for table, label in ((exact, key), (plain, _plain(key)), (ends, _plain(key) if "_" in key else "")):
+                if len(views := table.get(label, [])) == 1:
+                    return views
+        return []
+
+    return find
 
 
 def _stem(image: str) -> PurePosixPath:
@@ -296,42 +298,5 @@ def _split_number(name: str) -> tuple[str, int | None]:
     return prefix, int(name[len(prefix) :]) if len(prefix) < len(name) else None
 
 
-def _match_path(path: PurePosixPath, names: Sequence[str]) -> int | None:
-    """The view of a file name with as many of its folders as fit; then with numbers compared as numbers."""
-    # the names of views are made from paths in this way
-    keys = [re.sub(r"[^\w.-]", "_", "_".join(path.parts[i:])).lstrip("._") for i in range(len(path.parts))]
-    plain = [_plain(name) for name in names]
-    for key in keys:
-        if key in names:
-            return names.index(key)
-        if (view := _only([i for i, name in enumerate(plain) if name == _plain(key)])) is not None:
-            return view
-        ends = [i for i, name in enumerate(plain) if "_" in key and name.endswith("_" + _plain(key))]
-        if (view := _only(ends)) is not None:
-            return view
-    return None
-
-
-def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, int]:
-    """The views of image numbers, by the last number in the names of the views."""
-    of_view = {i: int(found[-1]) for i, name in enumerate(names) if (found := re.findall(r"\d+", name))}
-    shift, matched = 0, {}
-    known, wanted, count = sorted(set(numbers)), sorted(of_view.values()), len(names)
-    if known and all(each == list(range(each[0], each[0] + count)) for each in (known, wanted) if each):
-        shift = wanted[0] - known[0] if len(wanted) == count else 0
-    for number in set(numbers):
-        views = [i for i, value in of_view.items() if value == number + shift]
-        if len(views) > 1:
-            both = " and ".join(repr(names[i]) for i in views[:2])
-            raise ValueError(f"image number {number} could be view {both}: expected file names instead of numbers")
-        if views:
-            matched[number] = views[0]
-    return matched
-
-
 def _plain(name: str) -> str:
     return re.sub(r"(?<!\d)0+(?=\d)", "", name)
-
-
-def _only(found: list[int]) -> int | None:
-    return found[0] if len(found) == 1 else None
