@@ -1,7 +1,6 @@
 """The same weights, people and photos on other bodies: the default one, a made-up one in SMPL-X's format, and decimated ones."""
 
 import dataclasses
-import functools
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from experiments.harness import Run, entry, means
 from experiments.quality import COLUMNS, cells
 from experiments.results import markdown_table
-from experiments.subjects import RING, TASKS, People, make_evaluation_subject, score_tasks
+from experiments.subjects import RING, TASKS, People, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import EXPRESSION_COLUMNS, SHAPE_COLUMNS, load_body
@@ -47,7 +46,7 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
     cases, config = body_cases(start.body, start.config), as_it_is(start.config)
 
     def measure(seed: int) -> dict[str, Any]:
-        subject = make_evaluation_subject(seed, start.body, [views], start.size, start.held_out)
+        subject = start.subject(seed, [views])
         truth, painted = subject.held_out, painted_body(subject.inputs(views))
         row = {PAINTED: score_tasks(draw_painted_body(painted, truth), truth, start.lpips)}
         for name, case in cases.items():
@@ -56,12 +55,11 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
             row[name] = score_tasks(draw_views(avatar, other.held_out).images, truth, start.lpips)
         return row
 
-    settings = start.settings | {"views": views}
-    rows = list(run.rows({str(seed): functools.partial(measure, seed) for seed in start.seeds}, settings).values())
+    rows = start.rows(run, measure, {"views": views})
     bodies = means([{name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row} for row in rows])
     for name, case in cases.items():
         bodies[name] |= {"body_vertices": len(case.body.template), "vertices": len(case.carrier.template)}
-    numbers = {"bodies": bodies, "settings": settings, "people": len(rows)}
+    numbers = {"bodies": bodies, "settings": start.settings | {"views": views}, "people": len(rows)}
     run.show(f"{start.about()} {views} photos.\n\n{bodies_table(bodies)}", numbers)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import time
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -60,40 +59,31 @@ def make_case(seed, body, model, frames, views, size=512) -> FitCase:
         extrinsics.append(np.asarray(cameras.cam_from_world))
         intrinsics.append(np.asarray(cameras.K))
     rotations, translations = np.asarray(rotations, np.float32), np.asarray(translations, np.float32)
-    pose_all = jax.jit(jax.vmap(lambda r, t: pose_landmarks(model, jnp.asarray(subject.betas), BodyPose(r, t))))
-    landmarks, joints = pose_all(rotations, translations)
-    return FitCase(
-        subject.betas,
-        rotations,
-        translations,
-        np.asarray(joints),
-        np.asarray(landmarks),
-        np.stack(intrinsics),
-        np.stack(extrinsics),
-    )
+    landmarks, joints = _posed(model, subject.betas, rotations, translations)
+    return FitCase(subject.betas, rotations, translations, joints, landmarks, np.stack(intrinsics), np.stack(extrinsics))
 
 
-def walking(seeds, kind, frames, views, size=512):
-    """The landmark model of a keypoint set, and people of these seeds in the first frames of the shipped walk.
+def walking(model, seed, views=4, size=512) -> FitCase:
+    """The person of a seed in the first frames of the shipped walk; cameras stand still all around."""
+    motion, rng = load_motion(), np.random.default_rng([seed, POSE_STREAM])
+    rotations, translations = (np.asarray(x)[:FRAMES] for x in (motion.rotations, motion.translations))
+    betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
+    landmarks, joints = _posed(model, betas, rotations, translations)
+    azimuths = rng.uniform(0, 2 * np.pi) + np.arange(views) * (2 * np.pi / views)
+    K, middle = intrinsics_from_fov(1.0, size, size), jnp.asarray(joints.mean((0, 1)))
+    cameras = orbit(middle, 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, size, size)
+    still = lambda array: np.broadcast_to(np.asarray(array), (FRAMES, *array.shape))
+    return FitCase(betas, rotations, translations, joints, landmarks, still(cameras.K), still(cameras.cam_from_world))
 
-    Cameras stand still all around.
-    """
-    body, motion = load_body(), load_motion()
-    model = landmark_model(body, KEYPOINT_SETS[kind].names)
-    rotations, translations = (np.asarray(x)[:frames] for x in (motion.rotations, motion.translations))
-    pose_all = jax.jit(jax.vmap(lambda betas, r, t: pose_landmarks(model, betas, BodyPose(r, t)), (None, 0, 0)))
-    K = intrinsics_from_fov(1.0, size, size)
-    people = []
-    for seed in seeds:
-        rng = np.random.default_rng([seed, POSE_STREAM])
-        betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
-        landmarks, joints = (np.asarray(x) for x in pose_all(betas, rotations, translations))
-        azimuths = rng.uniform(0, 2 * np.pi) + np.arange(views) * (2 * np.pi / views)
-        cameras = orbit(jnp.asarray(joints.mean((0, 1))), 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, size, size)
-        still = lambda array: np.broadcast_to(np.asarray(array), (frames, *array.shape))
-        matrices = still(cameras.K), still(cameras.cam_from_world)
-        people.append(FitCase(betas, rotations, translations, joints, landmarks, *matrices))
-    return model, people
+
+@jax.jit
+def _pose_all(model, betas, rotations, translations):
+    return jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(rotations, translations)
+
+
+def _posed(model, betas, rotations, translations):
+    """Landmarks and joints of all frames."""
+    return tuple(np.asarray(x) for x in _pose_all(model, jnp.asarray(betas), rotations, translations))
 
 
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
@@ -181,28 +171,18 @@ def _errors(count, frames, setting):
     for _ in range(2):
         fit = jax.block_until_ready(fit_all(seen))
         times.append(time.perf_counter())
-    truth = np.stack([case.joints for case in people])
-    errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1)
-    found = joint_errors(errors) | landmark_errors(model, people, seen, fit)
-    found["root_aligned_mean_joint_error_mm"] = root_aligned(np.asarray(fit.joints), truth)
-    return found | {"seconds_per_frame": (times[2] - times[1]) / (count * frames), "first_call_s": times[1] - times[0]}
-
-
-def joint_errors(errors) -> dict:
-    """Of errors (people, m, j), millimetres."""
-    return {
+    truth, joints = np.stack([case.joints for case in people]), np.asarray(fit.joints)
+    errors, off = (1000 * np.linalg.norm(joints - x, axis=-1) for x in (truth, truth + joints[..., :1, :] - truth[..., :1, :]))
+    found = {
         "mean_joint_error_mm": float(errors.mean()),
         "p95_joint_error_mm": float(np.quantile(errors, 0.95)),
         "mean_body_joint_error_mm": float(errors[..., :22].mean()),
         "mean_hand_joint_error_mm": float(errors[..., 25:].mean()),
         "worst_frame_mean_mm": float(errors.mean(-1).max()),
     }
-
-
-def root_aligned(joints, truth) -> float:
-    """Mean error, millimetres, with the pelvis of each where the true one is: what a single view can know."""
-    moved = joints - joints[..., :1, :] + truth[..., :1, :]
-    return float(1000 * np.linalg.norm(moved - truth, axis=-1).mean())
+    found |= landmark_errors(model, people, seen, fit)
+    found["root_aligned_mean_joint_error_mm"] = float(off.mean())  # pelvis where the true one is: what a single view can know
+    return found | {"seconds_per_frame": (times[2] - times[1]) / (count * frames), "first_call_s": times[1] - times[0]}
 
 
 def landmark_errors(model, people, seen, fit) -> dict:
@@ -249,7 +229,6 @@ def fit_sequences(
     run: Run,
     smoothness: tuple[float, ...] = (0.005, 0.02),
     people: int = 3,
-    kind: Literal["coco17", "wholebody133"] = "wholebody133",
     cases: tuple[str, ...] = (),
 ) -> None:
     """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the shipped walk with known keypoints.
@@ -261,14 +240,13 @@ def fit_sequences(
     Options:
     smoothness: expected acceleration, metres per frame squared
     people: of the fitting seeds
-    kind: which keypoints
     cases: names; default: all
     """
-    model, made = walking(range(FIRST, FIRST + people), kind, FRAMES, 4)
+    model, made = _model(ALL), [walking(_model(ALL), seed) for seed in range(FIRST, FIRST + people)]
     ways = {"alone": 0.0} | {f"smooth {s:g}": s for s in smoothness}
     names = cases or tuple(CASES)
     each = {f"{name}: {way}": functools.partial(measure, model, made, name, s) for name in names for way, s in ways.items()}
-    rows = run.rows(each, {"people": people, "kind": kind})
+    rows = run.rows(each, {"people": people, "kind": ALL})
     show = lambda value: "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
     keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
     table = [[name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)] for name in names]
@@ -276,7 +254,7 @@ def fit_sequences(
     for what in keys.values():
         header += [f"{what}: one by one", *(f"{s:g}" for s in smoothness)]
     said = (
-        f"{people} people, {FRAMES} frames, {kind}, one by one and with these values of `--smoothness`; mean "
+        f"{people} people, {FRAMES} frames, {ALL}, one by one and with these values of `--smoothness`; mean "
         f"errors in millimetres, and millimetres per frame squared."
     )
     run.show(f"{markdown_table(header, table)}\n\n{said}", rows)

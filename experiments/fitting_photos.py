@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import pose_body, shape_body
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.data.capture import load_capture
 from humangs_jax.data.keypoints.keypoints import COCO_17, KEYPOINT_SETS, MEDIAPIPE_33, Keypoints, mirrored_name
 from humangs_jax.data.photos import Photos
 from humangs_jax.detection.people import Networks, detect_people
@@ -145,35 +145,23 @@ def solved(rows):
 
 
 VIEWS, SIZE = 4, 256
-
-
+KIND, NOISE_PX = "wholebody133", 2.0
+"""Keypoints that are detected, and their standard deviation in pixels of 512."""
 SCORES = {"psnr": "PSNR", "foreground": "foreground PSNR", "refined_psnr": "PSNR, refined"}
 SCORES |= {"refined_foreground": "foreground PSNR, refined"}
 
 
 @entry
-def fit_end_to_end(
-    run: Run,
-    people: int = 4,
-    noise_px: float = 2.0,
-    outliers: float = 0.0,
-    kind: Literal["coco17", "wholebody133", "openpose67"] = "wholebody133",
-    seconds: float = 5.0,
-    captures: Path | None = None,
-) -> None:
+def fit_end_to_end(run: Run, people: int = 4, seconds: float = 5.0) -> None:
     """What a fitted body costs in the end: photos and keypoints -> fit -> reconstruct -> refine, beside true body parameters.
 
-    People of the fitting seeds, four photos of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
-    accuracy of a detector that sees 512 pixels; cameras are true. Each reconstruction is drawn with the parameters it was made
-    from, fitted or true, and compared with held-out photos. About a minute a person after a minute of compilation.
+    People of the fitting seeds, four photos of 256 pixels each. Keypoints are the true ones of COCO-WholeBody with noise of 2
+    pixels of 512; cameras are true. Each reconstruction is drawn with the parameters it was made from, fitted or true, and
+    compared with held-out photos. About a minute a person after a minute of compilation.
 
     Options:
     people: of the fitting seeds
-    noise_px: standard deviation of detections, pixels of 512
-    outliers: share of points displaced by up to 100 pixels of 512
-    kind: which keypoints
     seconds: of refinement
-    captures: folder for the fitted captures, PERSON/ and PERSON/held_out/
     """
     if people < 1:
         raise ValueError(f"--people {people}: expected at least 1")
@@ -182,7 +170,7 @@ def fit_end_to_end(
     def measure(seed):
         subject = make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(views=6, poses=0))
         photos = subject.inputs(VIEWS)
-        fitted, millimetres = fitted_capture(photos, body, seed, kind, noise_px, outliers)
+        fitted, millimetres = fitted_capture(photos, body, seed)
         pictures = {}
         for name, inputs in (("true", photos), ("fitted", fitted)):
             views = dataclasses.replace(subject.held_out, poses=inputs.poses, betas=inputs.betas)
@@ -190,36 +178,29 @@ def fit_end_to_end(
             pictures[name] = draw_views(avatar, views).images
             avatar = refine(avatar, inputs, RefineConfig(seconds=seconds))
             pictures[f"{name}_refined"] = draw_views(avatar, views).images
-            if captures and name == "fitted":
-                save_capture(captures / str(seed), inputs)
-                save_capture(captures / str(seed) / "held_out", views)
         scores = {name: score(drawn, subject.held_out) for name, drawn in pictures.items()}
         row = {f"{name}_psnr": float(s.psnr) for name, s in scores.items()}
         return row | {f"{name}_foreground": float(s.psnr_fg) for name, s in scores.items()} | {"joints_mm": millimetres}
 
-    settings = {"noise_px": noise_px, "outliers": outliers, "set": kind, "seconds": seconds}
+    settings = {"noise_px": NOISE_PX, "outliers": 0.0, "set": KIND, "seconds": seconds}
     rows = run.rows({str(seed): functools.partial(measure, seed) for seed in range(FIRST, FIRST + people)}, settings)
     mean = means(list(rows.values()))
-    run.show(end_to_end_table(mean, len(rows)), {"settings": settings, "means": mean, "people": len(rows)})
-
-
-def end_to_end_table(mean: dict[str, float], people: int) -> str:
-    """Of true and of fitted parameters."""
     cells = [[f"{name} parameters", *(f"{mean[f'{name}_{key}']:.2f}" for key in SCORES)] for name in ("true", "fitted")]
-    text = markdown_table([f"means over {people} people", *SCORES.values()], cells)
-    return f"{text}\n\nMean joint error of the fits: {mean['joints_mm']:.1f} mm."
+    text = markdown_table([f"means over {len(rows)} people", *SCORES.values()], cells)
+    text += f"\n\nMean joint error of the fits: {mean['joints_mm']:.1f} mm."
+    run.show(text, {"settings": settings, "means": mean, "people": len(rows)})
 
 
-def fitted_capture(photos, body, seed, kind, noise_px, outliers):
+def fitted_capture(photos, body, seed):
     """The capture with a fitted body, and its mean joint error."""
-    keypoint_set = KEYPOINT_SETS[kind]
+    keypoint_set = KEYPOINT_SETS[KIND]
     model = landmark_model(body, keypoint_set.names)
     landmarks, joints = pose_landmarks(model, jnp.asarray(photos.betas), photos.pose(0))
     K, pose = np.asarray(photos.cameras.K)[None], np.asarray(photos.cameras.cam_from_world)[None]
     rotations, translations = np.asarray(photos.poses.rotations), np.asarray(photos.poses.translation)
     truth = (np.asarray(x)[None] for x in (joints, landmarks))
     case = FitCase(photos.betas, rotations, translations, *truth, K, pose)
-    points = detect(case, seed, noise_px * SIZE / 512, outliers, 100 * SIZE / 512)[0]
+    points = detect(case, seed, NOISE_PX * SIZE / 512, 0.0)[0]
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     keypoints = Keypoints(points.astype(np.float32), confidences, keypoint_set)
     seen = Photos(photos.images, photos.masks, photos.cameras, photos.frames, photos.names)
@@ -230,15 +211,9 @@ def fitted_capture(photos, body, seed, kind, noise_px, outliers):
 
 POSE_STREAM, CAMERA_STREAM, ERROR_STREAM, KEYPOINT_STREAM = 31, 32, 33, 34
 SUPERSAMPLING = 2
-
-
-@dataclasses.dataclass(frozen=True)
-class Errors:
-    """How far off a start is: share of the focal length, degrees of every camera about a random axis, degrees of every joint."""
-
-    focal: float = 0.05
-    turn: float = 2.0
-    bend: float = 3.0
+FOCAL, TURN, BEND = 0.05, 2.0, 3.0
+"""How far off a start is: share of the focal length, degrees of every camera about a random axis, degrees of every joint."""
+Given = Literal["bare", "clothed", "keypoints", "clothed+keypoints"]
 
 
 def true_captures(seed: int, body: Any, views: int, size: int = 512) -> tuple[Any, Any]:
@@ -263,17 +238,15 @@ def bare_masks(capture: Any) -> np.ndarray:
     return np.stack(masks)
 
 
-def augmented(capture: Any, seed: int, errors: Errors = Errors()) -> Any:
-    """The capture with focal lengths (all longer or all shorter), cameras (about their own centres) and joints off by fixed
-    amounts.
-    """
+def augmented(capture: Any, seed: int) -> Any:
+    """The capture with focal lengths (all longer or all shorter), cameras (about their own centres) and joints off."""
     rng = np.random.default_rng([seed, ERROR_STREAM])
     about = lambda count, degrees: jnp.asarray(np.radians(degrees) * _directions(rng, count), jnp.float32)
-    zoom = 1 + errors.focal * rng.choice([-1, 1])
+    zoom = 1 + FOCAL * rng.choice([-1, 1])
     K = capture.cameras.K * jnp.asarray([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
-    turns = transform.make(quaternion.matrix_from_axis_angle(about(capture.view_count, errors.turn)), jnp.zeros(3))
+    turns = transform.make(quaternion.matrix_from_axis_angle(about(capture.view_count, TURN)), jnp.zeros(3))
     rotations = capture.poses.rotations
-    bends = about(rotations.shape[0] * rotations.shape[1], errors.bend).reshape(rotations.shape)
+    bends = about(rotations.shape[0] * rotations.shape[1], BEND).reshape(rotations.shape)
     turned = quaternion.multiply(quaternion.from_axis_angle(rotations), quaternion.from_axis_angle(bends))
     return dataclasses.replace(
         capture,
@@ -300,11 +273,9 @@ def mean_overlap(capture: Any, masks: Any) -> float:
     return float(np.mean([overlap(body, mask) for body, mask in zip(covered, masks, strict=True)]))
 
 
-def joint_errors(capture: Any, truth: Any, joints: int = 22) -> tuple[float, float]:
-    """Mean distance of the first joints (the body's) from the true ones, metres: in the world, and after the best rigid
-    motion.
-    """
-    estimate, true = _joints(capture)[:, :joints].reshape(-1, 3), _joints(truth)[:, :joints].reshape(-1, 3)
+def joint_errors(capture: Any, truth: Any) -> tuple[float, float]:
+    """Mean distance of the body's joints from the true ones, metres: in the world, and after the best rigid motion."""
+    estimate, true = (_joints(each)[:, :22].reshape(-1, 3) for each in (capture, truth))
     raw = np.linalg.norm(estimate - true, axis=-1).mean()
     a, b = estimate - estimate.mean(0), true - true.mean(0)
     u, _, vt = np.linalg.svd(b.T @ a)
@@ -313,7 +284,6 @@ def joint_errors(capture: Any, truth: Any, joints: int = 22) -> tuple[float, flo
 
 
 def _joints(capture):
-
     rest = shape_body(capture.body, jnp.asarray(capture.betas))
     return np.asarray(jax.jit(jax.vmap(lambda pose: pose_body(capture.body, rest, pose).joints))(capture.poses))
 
@@ -353,18 +323,9 @@ def draw(path: Path, start: Any, refined: Any) -> None:
 def fit_refinement(
     run: Run,
     subjects: int = 4,
-    first: int = 0,
-    split: Literal["validation", "test", "fitting"] = "fitting",
     views: int = 6,
     size: int = 512,
-    noise_px: float = 2.0,
-    cases: tuple[Literal["bare", "clothed", "keypoints", "clothed+keypoints"], ...] = (
-        "bare",
-        "clothed",
-        "keypoints",
-        "clothed+keypoints",
-    ),
-    exact: bool = False,
+    cases: tuple[Given, ...] = get_args(Given),
     images: Path | None = None,
 ) -> None:
     """How much refinement mends cameras and poses that are a little off, on synthetic people of the fitting seeds.
@@ -377,24 +338,21 @@ def fit_refinement(
 
     Options:
     subjects: how many people
-    first: index of the first within the split
     views: photos of each
     size: side of the photos, pixels
-    noise_px: standard deviation of keypoints
     cases: what to refine by
-    exact: start at the truth: nothing should be kept
     images: folder for the body over the photos, before and after
     """
-    if min(subjects, views) < 1 or first < 0:
-        raise ValueError("--subjects and --views must be at least 1, --first at least 0")
+    if min(subjects, views) < 1:
+        raise ValueError("--subjects and --views must be at least 1")
     body = load_body()
 
     def measure(seed):
         clothed, bare = true_captures(seed, body, views, size)
-        keypoints, row = noisy_keypoints(clothed, seed, noise_px), {}
+        keypoints, row = noisy_keypoints(clothed, seed, NOISE_PX), {}
         for case in cases:
             truth = bare if case == "bare" else clothed
-            start = truth if exact else augmented(truth, seed)
+            start = augmented(truth, seed)
             given = dataclasses.replace(start, masks=None) if case == "keypoints" else start
             begun = time.perf_counter()
             refined = refine_capture(given, keypoints=keypoints if "keypoints" in case else None)
@@ -405,8 +363,8 @@ def fit_refinement(
                 draw(images / f"{seed}_{case}.png", start, refined.capture)
         return row
 
-    settings = {"split": split, "views": views, "size": size, "noise_px": noise_px, "exact": exact, "cases": cases}
-    seeds = seeds_of(split, first, subjects)
+    settings = {"split": "fitting", "views": views, "size": size, "noise_px": NOISE_PX, "exact": False, "cases": cases}
+    seeds = seeds_of("fitting", 0, subjects)
     rows = list(run.rows({str(seed): functools.partial(measure, seed) for seed in seeds}, settings).values())
     mean = means(rows)
     pair = lambda row, name, unit="", digits=1: (
@@ -414,18 +372,13 @@ def fit_refinement(
     )
     table = []
     for case, row in mean.items():
-        cells = [
-            pair(row, "iou", "", 3),
-            pair(row, "bare_iou", "", 3),
-            pair(row, "joints", "_mm"),
-            pair(row, "aligned", "_mm"),
-        ]
+        cells = [pair(row, "iou", "", 3), pair(row, "bare_iou", "", 3), pair(row, "joints", "_mm"), pair(row, "aligned", "_mm")]
         table.append([case, *cells, pair(row, "focal", "_percent"), f"{row['seconds']:.0f}"])
     halved = lambda case, name: sum(row[case][f"{name}_after_mm"] < 0.5 * row[case][f"{name}_before_mm"] for row in rows)
     lines = [f"{case}: {halved(case, 'joints')}, {halved(case, 'aligned')} aligned" for case in mean]
     header = ("refined by", "IoU with the masks", "with the true body", "joints, mm", "aligned, mm", "focal, %", "s")
     run.show(
-        f"{len(rows)} people ({split} split from {first}), {views} views of {size} px.\n\n{markdown_table(header, table)}\n\n"
+        f"{len(rows)} people (fitting split from 0), {views} views of {size} px.\n\n{markdown_table(header, table)}\n\n"
         f"People whose joint error was at least halved: {'; '.join(lines)}.",
         {"settings": settings, "cases": mean},
     )

@@ -1,6 +1,7 @@
 """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any."""
 
 import functools
+import itertools
 import time
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from experiments.harness import Run, entry
 from experiments.results import markdown_table, significant
@@ -24,8 +26,8 @@ from humangs_jax.people.subject import make_subject, seeds_of
 POSE_STREAM, JOINT_STREAM, PLACE_STREAM = 31, 33, 34
 PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 JOINTS = ("nose", *(f"{side}_{part}" for part in PAIRS for side in ("left", "right")))
-
-
+NOISE_MM = 5.0
+"""Standard deviation of the given joints, COCO's 17, in each direction."""
 SUCCESS = 50.0
 """Millimetres of vertices on average: people turned round are above 100."""
 
@@ -34,10 +36,7 @@ SUCCESS = 50.0
 def fit_scans(
     run: Run,
     subjects: int = 32,
-    first: int = 0,
-    split: Literal["validation", "test", "fitting"] = "fitting",
     kinds: tuple[Literal["bare", "clothed"], ...] = ("bare", "clothed"),
-    noise_mm: float = 5.0,
     without_joints: bool = False,
 ) -> None:
     """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any.
@@ -49,33 +48,22 @@ def fit_scans(
     as long.
 
     Options:
-    first: first person of the split
-    noise_mm: standard deviation of the given 17 joints of COCO in each direction
     without_joints: search for the pose (name the table fit_scans_without_joints)
     """
     if subjects < 1:
         raise ValueError("--subjects: expected at least 1")
-    body, seeds = load_body(), seeds_of(split, first, subjects)
-    cases = {
-        f"{kind} {seed}": functools.partial(fit_one, seed, kind, body, noise_mm, without_joints)
-        for seed in seeds
-        for kind in kinds
-    }
-    settings = {"split": split, "noise_mm": noise_mm, "joints": not without_joints}
+    body, each = load_body(), itertools.product(seeds_of("fitting", 0, subjects), kinds)
+    cases = {f"{kind} {seed}": functools.partial(fit_one, seed, kind, body, without_joints) for seed, kind in each}
+    settings = {"split": "fitting", "noise_mm": NOISE_MM, "joints": not without_joints}
     rows = run.rows(cases, settings)
     numbers: dict[str, Any] = {kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds}
-    run.show(scans_table(numbers, noise_mm, without_joints), numbers | {"settings": settings})
+    run.show(scans_table(numbers, without_joints), numbers | {"settings": settings})
 
 
-def scans_table(numbers: dict[str, Any], noise_mm: float, without_joints: bool) -> str:
+def scans_table(numbers: dict[str, Any], without_joints: bool) -> str:
     """One row for each kind: of all scans if joints were given, else of those whose pose was found."""
     if without_joints:
-        header = [
-            "scans, no joints",
-            f"found (vertices within {SUCCESS:g} mm)",
-            "of these: vertices, mean",
-            "surface, mean",
-        ]
+        header = ["scans, no joints", f"found (vertices within {SUCCESS:g} mm)", "of these: vertices, mean", "surface, mean"]
         shown = lambda value: "-" if value is None else f"{value:.1f} mm"
         rows = [
             [kind, f"{round(row['success'] * row['scans'])} of {row['scans']}"]
@@ -83,18 +71,18 @@ def scans_table(numbers: dict[str, Any], noise_mm: float, without_joints: bool) 
             for kind, row in numbers.items()
         ]
         return markdown_table(header, rows)
-    header = [f"scans, {len(JOINTS)} joints given with {noise_mm:g} mm of noise", "vertices, mean"]
+    header = [f"scans, {len(JOINTS)} joints given with {NOISE_MM:g} mm of noise", "vertices, mean"]
     header += ["surface, mean", "surface, worst person", "seconds a scan"]
     names = ("mean_vertex_mm", "mean_surface_mm", "worst_surface_mm")
     cells = lambda row: [*(f"{significant(row[name])} mm" for name in names), f"{row['seconds_per_scan']:.1f}"]
     return markdown_table(header, [[kind, *cells(row)] for kind, row in numbers.items()])
 
 
-def fit_one(seed, kind, body, noise_mm, without_joints):
+def fit_one(seed, kind, body, without_joints):
     """Scores of one scan."""
     true, landmarks, vertices, faces = person(seed, kind, body)
     place, rng = random_place(seed), np.random.default_rng([seed, JOINT_STREAM])
-    noisy = place(landmarks + rng.normal(0, noise_mm / 1000, landmarks.shape))
+    noisy = place(landmarks + rng.normal(0, NOISE_MM / 1000, landmarks.shape))
     joints = None if without_joints else dict(zip(JOINTS, noisy, strict=True))
     start = time.perf_counter()
     scan = sample_scan(place(vertices), faces)
@@ -125,14 +113,8 @@ def person(seed, kind, body):
 def random_place(seed):
     """A random similarity: any rotation, scale 0.1 to 100 by its logarithm, centre up to ten metres off before the scaling."""
     rng = np.random.default_rng([seed, PLACE_STREAM])
-    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    rotation = np.asarray(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    w, x, y, z = rng.normal(size=4)
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
     scale = float(10 ** rng.uniform(-1, 2))
     return Similarity(scale, rotation, scale * rng.uniform(-10, 10, 3))
 
@@ -155,15 +137,15 @@ def distances_to_surface(points, vertices, faces):
 
 def summary(rows):
     """Of one kind of scans."""
-    mean = lambda name: float(np.mean([row[name] for row in rows]))
+    mean = lambda name, rows: float(np.mean([row[name] for row in rows])) if rows else None
     good = [row for row in rows if row["vertex_mm"] < SUCCESS]
     return {
         "scans": len(rows),
-        "mean_vertex_mm": mean("vertex_mm"),
-        "mean_surface_mm": mean("surface_mm"),
+        "mean_vertex_mm": mean("vertex_mm", rows),
+        "mean_surface_mm": mean("surface_mm", rows),
         "worst_surface_mm": max(row["surface_mm"] for row in rows),
         "success": len(good) / len(rows),
-        "mean_vertex_mm_of_successes": float(np.mean([row["vertex_mm"] for row in good])) if good else None,
-        "mean_surface_mm_of_successes": float(np.mean([row["surface_mm"] for row in good])) if good else None,
+        "mean_vertex_mm_of_successes": mean("vertex_mm", good),
+        "mean_surface_mm_of_successes": mean("surface_mm", good),
         "seconds_per_scan": float(np.median([row["seconds"] for row in rows])),
     }

@@ -2,7 +2,6 @@
 
 import functools
 from pathlib import Path
-from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,19 +33,18 @@ DEEP = 0.01
 
 
 @entry
-def people_faults(run: Run, subjects: int = 200, size: int = 256, first: int = 0) -> None:
+def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
     """Faults of synthetic people: counted in images of random poses from random cameras, as shares of the person's pixels.
 
     Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin that cloth covers well is not in
     the mesh at all and cannot poke: see hollow. A second a person. Expected: poking below 0.1 %.
 
     Options:
-    subjects: people that are built, posed and rendered
+    subjects: people of the training seeds that are built, posed and rendered
     size: side of the pictures
-    first: first seed (training people by default)
     """
     body = load_body()
-    cases = {str(first + i): functools.partial(look_at, body, first + i, size) for i in range(subjects)}
+    cases = {str(seed): functools.partial(look_at, body, seed, size) for seed in range(subjects)}
     rows = run.rows(cases, {"size": size})
     numbers, table, pixels = {}, [], np.asarray([row["pixels"] for row in rows.values()])
     for name, definition in FAULTS.items():
@@ -68,15 +66,14 @@ def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
 
 
 @entry
-def people_diversity(run: Run, people: int = 1000, first: int = 0) -> None:
+def people_diversity(run: Run, people: int = 1000) -> None:
     """How much synthetic people differ, by their descriptions. Seconds.
 
     Options:
-    people: how many
-    first: first seed (training people by default)
+    people: how many, of the training seeds
     """
     body = load_body()
-    described = [describe(first + i, body) for i in range(people)]
+    described = [describe(seed, body) for seed in range(people)]
     betas, marks = np.stack([p.betas for p in described]), {}
     spreads = {
         "stature, m": ([p.stature for p in described], 2),
@@ -126,7 +123,6 @@ def count_faults(body, posed, camera):
 
 
 def _faces_the_eye(vertices, faces, eye):
-
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
 
@@ -143,137 +139,105 @@ TELE = 0.42
 
 
 @entry
-def people_sheets(
-    run: Run,
-    out: Path = Path("docs/images"),
-    sheets: tuple[Literal["front_back", "views", "close", "sequences"], ...] = (
-        "front_back",
-        "views",
-        "close",
-        "sequences",
-    ),
-    subjects: int = 64,
-    scale: float = 1.0,
-    suffix: Literal[".jpg", ".png"] = ".jpg",
-) -> None:
+def people_sheets(run: Run, out: Path = Path("docs/images"), subjects: int = 64) -> None:
     """Contact sheets of synthetic people: front and back, 16 of them all around, 8 heads and hands, 8 sequences of 8 frames.
 
     All four take 90 s of one CPU core. The same command gives the same images bit for bit on the same machine.
 
     Options:
     out: folder to write into
-    sheets: which
     subjects: people on the first sheet, of the demo seeds
-    scale: size of the pictures
-    suffix: kind of file
     """
     body = load_body()
     out.mkdir(parents=True, exist_ok=True)
-    counts = {"front_back": subjects, "views": 16, "close": 8, "sequences": 8}
     makers = {"front_back": front_back, "views": all_around, "close": close_ups, "sequences": motions}
-    for i, name in enumerate(counts):
-        if name in sheets:
-            sheet = makers[name](body, DEMO[100 * i : 100 * i + counts[name]], scale)
-            pixels, file = np.round(np.clip(sheet, 0, 1) * 255).astype(np.uint8), out / f"people_{name}{suffix}"
-            Image.fromarray(pixels).save(file, quality=QUALITY)  # of a JPEG
-            print(f"{file}: {sheet.shape[1]} x {sheet.shape[0]}, {file.stat().st_size / 1e3:.0f} kB")
+    for i, ((name, maker), count) in enumerate(zip(makers.items(), (subjects, 16, 8, 8), strict=True)):
+        sheet, file = maker(body, DEMO[100 * i : 100 * i + count]), out / f"people_{name}.jpg"
+        pixels = np.round(np.clip(sheet, 0, 1) * 255).astype(np.uint8)
+        Image.fromarray(pixels).save(file, quality=QUALITY)
+        print(f"{file}: {sheet.shape[1]} x {sheet.shape[0]}, {file.stat().st_size / 1e3:.0f} kB")
 
 
-def front_back(body, seeds, scale):
+def front_back(body, seeds):
     """Rows of people from the front, each over a row of the same people from behind."""
     cells = []
     for seed in seeds:
-        posed = _person(seed, body)
+        posed = sample_pose(make_subject(seed, body), 0)
         turn = posed.rotations[0, 1]
-        cells.append([_whole(posed, turn + a, FRONT_BACK_SIZE, scale) for a in (0.25, np.pi + 0.25)])
-    rows = []
-    for start in range(0, len(cells), COLUMNS):
-        chosen = cells[start : start + COLUMNS]
-        rows += [[pair[0] for pair in chosen], [pair[1] for pair in chosen]]
-    return _grid(rows)
+        cells.append([_whole(posed, turn + a, FRONT_BACK_SIZE) for a in (0.25, np.pi + 0.25)])
+    chunks = [cells[start : start + COLUMNS] for start in range(0, len(cells), COLUMNS)]
+    return _grid([[pair[side] for pair in chosen] for chosen in chunks for side in (0, 1)])
 
 
-def all_around(body, seeds, scale):
+def all_around(body, seeds):
     """One row a person, eight views around; two people side by side."""
     rows = []
     for seed in seeds:
-        posed = _person(seed, body)
+        posed = sample_pose(make_subject(seed, body), 0)
         azimuths = posed.rotations[0, 1] + np.arange(8) * (np.pi / 4)
-        rows.append([_whole(posed, a, VIEW_SIZE, scale) for a in azimuths])
-    half = (len(rows) + 1) // 2
-    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
+        rows.append([_whole(posed, a, VIEW_SIZE) for a in azimuths])
+    return _in_pairs(rows)
 
 
-def close_ups(body, seeds, scale):
+def close_ups(body, seeds):
     """A row of heads, a row of the same heads from the side, a row of hands."""
     rows = [[], [], []]
     for seed in seeds:
-        posed = _person(seed, body)
+        posed = sample_pose(make_subject(seed, body), 0)
         world, joints = anatomy.joint_positions(posed.subject.build, posed.rotations.astype(float))
         joints = joints + posed.translation
         facing = _azimuth(world[anatomy.HEAD] @ [0, 0, 1])
         middle = joints[anatomy.HEAD] + world[anatomy.HEAD] @ [0, 0.085, 0.02]
-        rows[0].append(_near(posed, middle, 0.17, facing + 0.35, 0.05, scale))
-        rows[1].append(_near(posed, middle, 0.17, facing + 1.6, 0.05, scale))
+        rows[0].append(_near(posed, middle, 0.17, facing + 0.35, 0.05))
+        rows[1].append(_near(posed, middle, 0.17, facing + 1.6, 0.05))
         hand = anatomy.LEFT_WRIST if seed % 2 else anatomy.RIGHT_WRIST
         knuckles = joints[anatomy.LEFT_HAND + 3 if seed % 2 else anatomy.RIGHT_HAND + 3]
         outwards = _azimuth(knuckles - joints[anatomy.SPINE2])
-        rows[2].append(_near(posed, 0.4 * joints[hand] + 0.6 * knuckles, 0.15, outwards, 0.1, scale))
+        rows[2].append(_near(posed, 0.4 * joints[hand] + 0.6 * knuckles, 0.15, outwards, 0.1))
     return _grid(rows)
 
 
-def motions(body, seeds, scale):
+def motions(body, seeds):
     """One row a sequence, eight frames over two and a half seconds, the camera beside the walker; two sequences side by side."""
     rows = []
     for seed in seeds:
         subject = make_subject(seed, body)
         motion = sample_motion(subject, MOTION_FRAMES)
         rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-        frames = np.linspace(0, len(rotations) - 1, 8).astype(int)
-        start = pose_subject(subject, rotations[0], translations[0])
-        facing = _azimuth(poses_world(subject, rotations[0]) @ [0, 0, 1])
-        posed = [start if i == 0 else pose_subject(subject, rotations[i], translations[i]) for i in frames]
-        rows.append([_whole(p, facing + 0.7, VIEW_SIZE, scale) for p in posed])
-    half = (len(rows) + 1) // 2
-    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
-
-
-def poses_world(subject, rotations):
-    """(3, 3) rotation of the pelvis."""
-    return anatomy.joint_positions(subject.build, rotations.astype(float))[0][anatomy.PELVIS]
-
-
-def _person(seed, body, pose=0):
-
-    return sample_pose(make_subject(seed, body), pose)
+        pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][anatomy.PELVIS]
+        facing = _azimuth(pelvis @ [0, 0, 1])
+        posed = [pose_subject(subject, rotations[i], translations[i]) for i in np.linspace(0, len(rotations) - 1, 8).astype(int)]
+        rows.append([_whole(p, facing + 0.7, VIEW_SIZE) for p in posed])
+    return _in_pairs(rows)
 
 
 def _azimuth(direction):
-
     return float(np.arctan2(direction[0], direction[2]))
 
 
-def _camera(target, distance, azimuth, elevation, fov, size, scale):
-
-    width, height = (2 * round(s * scale / 2) for s in size)
-    K = intrinsics_from_fov(fov, width, height)
-    azimuths = jnp.asarray([azimuth], jnp.float32)
-    return orbit(jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, width, height)[0]
+def _seen(posed, target, distance, azimuth, elevation, fov, size):
+    K, azimuths = intrinsics_from_fov(fov, *size), jnp.asarray([azimuth], jnp.float32)
+    camera = orbit(jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, *size)[0]
+    return render_view(posed, camera)[0]
 
 
-def _whole(posed, azimuth, size, scale):
+def _whole(posed, azimuth, size):
     """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the image's height."""
     low, high = posed.vertices.min(0), posed.vertices.max(0)
     reach = max(2.25, 1.1 * (high[1] - low[1]))
     target = [0.5 * (low[0] + high[0]), low[1] + 0.455 * reach, 0.5 * (low[2] + high[2])]
-    distance = 0.5 * reach / np.tan(0.5 * TELE) + 0.3
-    return render_view(posed, _camera(target, distance, azimuth, 0.05, TELE, size, scale))[0]
+    return _seen(posed, target, 0.5 * reach / np.tan(0.5 * TELE) + 0.3, azimuth, 0.05, TELE, size)
 
 
-def _near(posed, target, reach, azimuth, elevation, scale):
+def _near(posed, target, reach, azimuth, elevation):
     """A close-up of `reach` metres around a point, from a metre away."""
-    fov = 2 * np.arctan(reach / 1.2)
-    return render_view(posed, _camera(target, 1.2, azimuth, elevation, fov, CLOSE_SIZE, scale))[0]
+    return _seen(posed, target, 1.2, azimuth, elevation, 2 * np.arctan(reach / 1.2), CLOSE_SIZE)
+
+
+def _in_pairs(rows):
+    """A grid of two columns of rows."""
+    half = (len(rows) + 1) // 2
+    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
 
 
 def _grid(rows):

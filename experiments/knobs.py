@@ -55,30 +55,10 @@ PRESETS_HEAD = """
 
 def page() -> str:
     """The page in Markdown."""
-    classes = (
-        Runtime,
-        Conventions,
-        PatchTransformer,
-        VertexDecoder,
-        SplatConfig,
-        RasterConfig,
-        RefineConfig,
-        TrainConfig,
-        OnTheFlyConfig,
-        Settings,
-    )
-    rows = [row for cls in classes for row in knob_rows(cls)]
-    return (
-        HEAD
-        + "\n".join(rows)
-        + "\n"
-        + PRESETS_HEAD
-        + "\n".join(preset_rows())
-        + "\n"
-        + FIELDS_HEAD
-        + "\n".join(field_rows())
-        + "\n"
-    )
+    classes = Runtime, Conventions, PatchTransformer, VertexDecoder, SplatConfig, RasterConfig, RefineConfig, TrainConfig
+    rows = [row for cls in (*classes, OnTheFlyConfig, Settings) for row in knob_rows(cls)]
+    sections = {HEAD: rows, PRESETS_HEAD: preset_rows(), FIELDS_HEAD: field_rows()}
+    return "".join(head + "\n".join(rows) + "\n" for head, rows in sections.items())
 
 
 def preset_rows() -> list[str]:

@@ -302,12 +302,8 @@ def write_actorshq(out: Path, **how: Any) -> Path:
     return folder
 
 
-def write_dna(out: Path, enlarged: int = 1, lens: Sequence[float] = (0.0,) * 5, **how: Any) -> Path:
-    """out/body.npz and out/dna with main/0001_01.smc and its annotations; returns the data set. Needs h5py.
-
-    enlarged: how many pixels a side each rendered one becomes. lens: k1 k2 p1 p2 k3 that the file names, for measuring what
-    undistortion takes; photos are rendered without. how: of a `Video`.
-    """
+def write_dna(out: Path, **how: Any) -> Path:
+    """out/body.npz and out/dna with main/0001_01.smc and its annotations; returns the data set. Needs h5py. how: of a `Video`."""
     h5py: Any = importlib.import_module("h5py")
     video, folder = Video(out, **how), out / "dna"
     means = np.load(out / "body.npz")
@@ -316,8 +312,7 @@ def write_dna(out: Path, enlarged: int = 1, lens: Sequence[float] = (0.0,) * 5, 
 
     def encoded(pixels: np.ndarray, kind: str) -> np.ndarray:
         stream = io.BytesIO()
-        image = Image.fromarray(to_uint8(pixels))
-        image.resize((enlarged * image.width, enlarged * image.height)).save(stream, kind, quality=95)
+        Image.fromarray(to_uint8(pixels)).save(stream, kind, quality=95)
         return np.frombuffer(stream.getvalue(), np.uint8)
 
     with (
@@ -329,9 +324,8 @@ def write_dna(out: Path, enlarged: int = 1, lens: Sequence[float] = (0.0,) * 5, 
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = video.R[c], video.T[c]
             K = video.K.copy()
-            K[:2] *= enlarged
             K[:2, 2] -= 0.5
-            inner = {"K": K, "D": np.asarray(lens), "RT": np.linalg.inv(pose), "Color_Calibration": np.eye(3)}
+            inner = {"K": K, "D": np.zeros(5), "RT": np.linalg.inv(pose), "Color_Calibration": np.eye(3)}
             for key, value in inner.items():
                 notes[f"Camera_Parameter/{c:02d}/{key}"] = value
             for f, posed in enumerate(video.posed):

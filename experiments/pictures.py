@@ -1,67 +1,34 @@
-"""Images of an evaluation: the best people beside the worst, and PSNR against the number of views."""
+"""Images of an evaluation: the same views of many people, their faces, hands, hems and shoes; README's pictures."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from PIL import Image
+from skimage.transform import resize
 
 from experiments.harness import Run, entry
-from experiments.subjects import TASKS, Drawn, task_views
-from humangs_jax.avatar.video import GAP, tile, write_texts
-from humangs_jax.data.capture import Capture
-from humangs_jax.io.images import to_uint8, write_png
+from humangs_jax.avatar.animate import animate
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import a_pose_of, images, motion_views, turntable_views
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.avatar.video import tile, write_video
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.motion import load_motion
+from humangs_jax.geometry.camera import look_at, project
+from humangs_jax.io.images import to_uint8
+from humangs_jax.rendering.splatting import render
 
-TRIPLE = ("truth", "ours", "vertex-color baseline")
 CROP = 0.75
 """Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
-TITLE = 22
-"""Height of the letters of titles, pixels."""
 DETAILS = {"face": (("left_eye", "right_eye"), 0.3), "hand": (("left_middle1", "left_index1"), 0.3),
            "hem": (("left_hip", "left_knee"), 0.5), "shoe": (("left_ankle", "left_foot"), 0.36)}  # fmt: skip
 """What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
 DETAIL_PIXELS = 96
-Strip = dict[str, np.ndarray]
-"""By task: truth, ours and the vertex-color baseline of the first held-out view, (3, h, w, 3) of 8 bits."""
-
-
-def strip_of(drawn: Drawn, held_out: Capture) -> Strip:
-    """What a sheet shows of a person."""
-    strips = {}
-    for task, views in task_views(held_out).items():
-        if len(views):
-            triple = [pictures[views[0]] for pictures in (held_out.images, drawn.ours, drawn.painted)]
-            strips[task] = to_uint8(np.stack(triple))
-    return strips
-
-
-def write_sheet(
-    path: Path, shown: tuple[Sequence[int], Sequence[int]], rows: Mapping[int, Any], strips: Mapping[int, Strip]
-) -> None:
-    """The best people on the left, the worst on the right: one row each, both tasks, PSNR of the person's views above.
-
-    shown: the best and the worst, by seed. rows, strips: scores by task and images of at least these.
-    """
-    halves = [(name, seeds) for name, seeds in zip(("best", "worst"), shown, strict=True) if seeds]
-    sheets = [_half(name, seeds, rows, strips) for name, seeds in halves]
-    gap = np.ones((sheets[0].shape[0], 6 * GAP, 3))
-    write_png(path, np.concatenate([x for sheet in sheets for x in (sheet, gap)][:-1], axis=1))
-
-
-def _half(name, seeds, rows, strips):
-    tasks = [task for task in TASKS if task in strips[seeds[0]]]
-    images, labels = [], []
-    for seed in seeds:
-        for task in tasks:
-            scores = rows[seed][task]
-            images += [cropped(image) for image in strips[seed][task]]
-            labels += [f"seed {seed}", f"ours {scores['psnr']:.1f} dB", f"baseline {scores['baseline_psnr']:.1f} dB"]
-    sheet = tile(np.stack(images) / 255, labels=labels, columns=len(TRIPLE) * len(tasks))
-    strip = np.ones((TITLE + 2 * GAP, sheet.shape[1], 3))
-    width = sheet.shape[1] // len(tasks)
-    titles = [(f"{name}: {TASKS[task]}", GAP + i * width, GAP, width - GAP) for i, task in enumerate(tasks)]
-    return np.concatenate([write_texts(strip, titles, TITLE), sheet])
 
 
 def cropped(image: np.ndarray) -> np.ndarray:
@@ -79,12 +46,6 @@ def frontal_view(photos: Capture, held_out: Capture, views: Sequence[int]) -> in
 
 def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
     """Squares of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3); white beyond its border."""
-    import jax.numpy as jnp
-    from skimage.transform import resize
-
-    from humangs_jax.body.model import pose_body, shape_body
-    from humangs_jax.geometry.camera import project
-
     body, camera = capture.body, capture.cameras[view]
     pose = capture.pose(int(np.asarray(capture.frames)[view]))
     joints = pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints
@@ -101,15 +62,13 @@ def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
 
 def write_triples(
     path: Path,
-    images: Mapping[Any, Sequence[np.ndarray]],
+    people: Mapping[Any, Sequence[np.ndarray]],
     across: int = 2,
     headers: tuple[str, ...] = ("truth", "feed-forward", "refined"),
 ) -> None:
     """The same images of every person, as a JPEG; `across` people a row."""
-    from PIL import Image
-
-    tiles = np.stack([image for drawn in images.values() for image in drawn])
-    headers *= min(across, len(images))
+    tiles = np.stack([image for drawn in people.values() for image in drawn])
+    headers *= min(across, len(people))
     sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
     sheet.save(path, format="JPEG", quality=85)
 
@@ -128,29 +87,14 @@ def readme_pictures(run: Run, avatar: Path, out: Path = Path("docs/images"), siz
     """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in new poses, and its face.
 
     Options:
-        avatar: avatar.npz of `humangs demo`
-        out: folder of the images
-        size: height of a picture, pixels
+    avatar: avatar.npz of `humangs demo`
+    out: folder of the images
+    size: height of a picture, pixels
     """
-    import jax.numpy as jnp
-    from PIL import Image
-
-    from humangs_jax.avatar.animate import animate
-    from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.frames import a_pose_of, images, motion_views, turntable_views
-    from humangs_jax.avatar.shot import Shot
-    from humangs_jax.avatar.video import write_video
-    from humangs_jax.body.model import BodyPose
-    from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.motion import load_motion
-    from humangs_jax.geometry.camera import look_at
-    from humangs_jax.rendering.splatting import render
-
     person, photos = Avatar.load(avatar), load_capture("demo_capture")
     shot = Shot(size=size, azimuth=0.0)
 
-    def drawn(pose: BodyPose, shot: Shot) -> np.ndarray:
-        return next(images(person, *turntable_views(person, pose, 1, shot), shot))
+    drawn = lambda pose, shot: next(images(person, *turntable_views(person, pose, 1, shot), shot))
 
     def posed(turns: Mapping[str, tuple[float, float, float]]) -> BodyPose:
         rotations = np.zeros((len(person.parents), 3), np.float32)
@@ -165,15 +109,8 @@ def readme_pictures(run: Run, avatar: Path, out: Path = Path("docs/images"), siz
     pictures += [drawn(posed(turns), dataclasses.replace(shot, azimuth=30.0)) for turns in POSES.values()]
     head = person.rest_joints[person.joint_names.index("head")]
     K = jnp.asarray([[2.6 * size, 0, size / 2], [0, 2.6 * size, size / 2], [0, 0, 1]])
-    eye = jnp.asarray([0.35, 0.05, 1.5])
-    face = look_at(
-        head + jnp.asarray([0, 0.06, 0.0]) + eye,
-        head + jnp.asarray([0, 0.06, 0.0]),
-        jnp.asarray([0.0, 1, 0]),
-        K,
-        size,
-        size,
-    )
+    target = head + jnp.asarray([0, 0.06, 0.0])
+    face = look_at(target + jnp.asarray([0.35, 0.05, 1.5]), target, jnp.asarray([0.0, 1, 0]), K, size, size)
     pictures.append(np.clip(np.asarray(render(animate(person, posed({})), face).rgb), 0, 1))
     strip = np.concatenate([_framed(x, size) for x in pictures], axis=1)
     Image.fromarray(to_uint8(strip)).save(out / "readme.jpg", quality=88)

@@ -12,24 +12,13 @@ import numpy as np
 from scipy import ndimage
 
 from experiments.harness import Run, entry, figure, means
-from experiments.pictures import cropped, frontal_view, strip_of, write_sheet, write_triples
+from experiments.pictures import cropped, frontal_view, write_triples
 from experiments.results import markdown_table, page_of
-from experiments.subjects import (
-    RING,
-    TASKS,
-    HeldOut,
-    People,
-    Scores,
-    draw_person,
-    make_evaluation_subject,
-    score_person,
-    score_tasks,
-    shipped_digest,
-)
+from experiments.subjects import RING, TASKS, HeldOut, People, Scores, score_tasks, shipped_digest
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
-from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 from humangs_jax.people.subject import make_subject
 from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 from humangs_jax.people.writer import View, capture_views, sample_pose
@@ -38,7 +27,7 @@ from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine
 
 PHOTOS = 4
-ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None)
+AVATARS, ITERATIONS_ALONE = ("pass", "4 iterations"), RefineConfig(steps=0, seconds=None)
 
 # Numbers of photos ---------------------------------------------------------------------------------------------------
 
@@ -52,8 +41,6 @@ COLUMNS = {  # heading and digits
     "baseline_lpips": ("LPIPS", 3),
     "baseline_psnr_fg": ("foreground PSNR", 2),
 }
-EXTREMES = 5
-"""People at either end who are shown."""
 
 
 @entry
@@ -61,7 +48,6 @@ def evaluation_views(
     run: Run,
     people: People = People(32),
     views: tuple[int, ...] = (1, 2, 4, 6),
-    images: Path | None = None,
     plot: Path | None = None,
 ) -> None:
     """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in others.
@@ -71,33 +57,29 @@ def evaluation_views(
 
     Options:
     views: numbers of photos that the network sees; they divide 12
-    images: the best five people beside the worst five, by PSNR
     plot: PSNR against the number of photos
     """
     start, views = people.start(), tuple(sorted(set(views)))
     if any(count < 1 or RING % count for count in views):
         raise ValueError(f"--views: expected numbers that divide {RING}, got {views}")
-    subject = functools.lru_cache(1)(lambda seed: make_evaluation_subject(seed, start.body, views, start.size, start.held_out))
+    subject = functools.lru_cache(1)(lambda seed: start.subject(seed, views))
 
     def measure(seed, count):
-        drawn, truth = draw_person(start.variables, start.config, subject(seed), count), subject(seed).held_out
-        return score_person(drawn, truth, start.lpips), strip_of(drawn, truth)
+        truth, inputs = subject(seed).held_out, subject(seed).inputs(count)
+        drawn = draw_views(reconstruct(start.variables, start.config, inputs), truth).images
+        ours, baseline = (score_tasks(x, truth, start.lpips) for x in (drawn, draw_painted_body(painted_body(inputs), truth)))
+        compared = lambda task: {f"baseline_{name}": baseline[task][name] for name in ("psnr", "ssim", "psnr_fg", "lpips")}
+        return {task: ours[task] | compared(task) for task in ours}
 
     chosen = 4 if 4 in views else max(views)
     cases = {f"{s}, {n} photos": functools.partial(measure, s, n) for s in start.seeds for n in views}
     rows = run.rows(cases, start.settings)
     by_views = {n: {seed: rows[f"{seed}, {n} photos"] for seed in start.seeds} for n in views}
     section = views_section(by_views, chosen, start.about())
-    link = lambda path: Path(os.path.relpath(path, page_of(run.table).parent)).as_posix()
     if plot:
         plot_views(plot, {n: means(list(row.values())) for n, row in by_views.items()})
-        section += f"\n\n![PSNR against the number of photos]({link(plot)})"
-    if images:
-        shown = extremes(by_views[chosen])
-        strips = {seed: run.pictures.get(f"{seed}, {chosen} photos") for seed in (*shown[0], *shown[1])}
-        strips = {seed: strip or measure(seed, chosen)[1] for seed, strip in strips.items()}
-        write_sheet(images, shown, by_views[chosen], strips)
-        section += f"\n\n![The best people beside the worst: truth, ours, vertex-color baseline]({link(images)})"
+        link = Path(os.path.relpath(plot, page_of(run.table).parent)).as_posix()
+        section += f"\n\n![PSNR against the number of photos]({link})"
     numbers = {n: means(list(row.values())) for n, row in by_views.items()}
     run.show(section, {"views": chosen, "by_views": numbers, "settings": start.settings, "people": len(start.seeds)})
 
@@ -124,13 +106,6 @@ def cells(scores: Scores, keys: Sequence[str]) -> list[str]:
     """Numbers with their digits; a dash for what is missing."""
     values = [(scores.get(key), COLUMNS[key][1]) for key in keys]
     return ["-" if value is None else f"{value:.{digits}f}" for value, digits in values]
-
-
-def extremes(rows: dict[int, Any]) -> tuple[list[int], list[int]]:
-    """The best people, best first, and the worst, worst first, by PSNR of new views: at most `EXTREMES` each, nobody twice."""
-    order = sorted(rows, key=lambda seed: -rows[seed]["novel"]["psnr"])
-    count = min(EXTREMES, max(1, len(order) // 2))
-    return order[:count], order[count:][::-1][:count]
 
 
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
@@ -165,22 +140,15 @@ LIGHT_POSES, LIGHT_HELD_OUT = 6, 3
 
 
 @entry
-def light(run: Run, people: People = People(16), sheet: Path | None = None) -> None:
+def light(run: Run, people: People = People(16)) -> None:
     """What the light of the photos gains: avatars with it and without, and the limit of those without.
 
     "One pose": four photos of one pose. "Four poses": one photo of each of four poses. Avatars are those of the pass and of the
     iterations of refinement. "True surface": the generator's own people in a new pose, with the light that each point has in the
     photos of one pose: the best that an avatar with fixed colors can do.
-
-    Options:
-    sheet: JPEG of an novel pose of every person: truth, without and with the light
     """
-    start = people.start()
-    settings = start.settings | {"refiner": shipped_digest(SHIPPED_REFINER)}
-    cases = {str(seed): functools.partial(_light_of, start, seed) for seed in start.seeds}
-    mean = means(list(run.rows(cases, settings, again=bool(sheet)).values()))
-    if sheet:
-        write_triples(sheet, run.pictures, 2, ("truth", "fixed colors", "light of the photos"))
+    start, refiner = people.start(), {"refiner": shipped_digest(SHIPPED_REFINER)}
+    mean = means(start.rows(run, functools.partial(_light_of, start), refiner))
     keys = ("psnr", "psnr_fg", *(["lpips"] if start.lpips else []))
     rows = []
     for name, tasks in mean.items():
@@ -193,11 +161,11 @@ def light(run: Run, people: People = People(16), sheet: Path | None = None) -> N
     about = f"Means over {len(start.seeds)} people of the {people.split} seeds, four photos of {people.size} px; dB" + (
         f"; LPIPS {people.lpips_net}." if start.lpips else "."
     )
-    run.show(f"{about}\n\n{table}", {"settings": settings, "means": mean})
+    run.show(f"{about}\n\n{table}", {"settings": start.settings | refiner, "means": mean})
 
 
 def _light_of(start, seed):
-    """Scores by avatar and task of one person; an novel pose, true, and after the iterations without and with the light."""
+    """Scores by avatar and task of one person."""
     subject, rng = make_subject(seed, start.body), np.random.default_rng([seed, RING])
     posed = [sample_pose(subject, i) for i in range(LIGHT_POSES)]
     rings = [cameras_around(rng, pose.vertices, spread_azimuths(rng, RING), start.size) for pose in posed]
@@ -208,8 +176,7 @@ def _light_of(start, seed):
     }
     views = [View(i, f"{i}_{k}", held[i][k]) for i in range(LIGHT_POSES) for k in range(LIGHT_HELD_OUT)]
     truth, found = capture_views(subject, start.body, posed, views), {}
-    shown = [next(i for i, view in enumerate(views) if view.frame == LIGHT_POSES - 1)]
-    images, frames = [truth.images[shown[0]]], np.asarray(truth.frames)
+    frames = np.asarray(truth.frames)
 
     def scores(drawn, seen):
         by_task = {}
@@ -223,23 +190,19 @@ def _light_of(start, seed):
         photos = capture_views(subject, start.body, posed, photographed)
         for lit, how in (("without", start.config.with_conventions(light=False)), ("with", start.config)):
             avatar = reconstruct(start.variables, how, photos)
-            iterations = refine(avatar, photos, ITERATIONS_ALONE)
-            for label, made in (("pass", avatar), ("4 iterations", iterations)):
+            for label, made in zip(AVATARS, (avatar, refine(avatar, photos, ITERATIONS_ALONE)), strict=True):
                 drawn = draw_views(made, truth).images
                 found[f"{name}, {label}, {lit}"] = scores(drawn, sorted({view.frame for view in photographed}))
-            if name == "one pose":
-                images += list(draw_views(iterations, truth.select(shown)).images)
     light_of_first = {key: getattr(posed[0], key) for key in ("normals", "openness", "lit")}
     fixed = [dataclasses.replace(pose, **light_of_first) for pose in posed]
     found["true surface"] = scores(capture_views(subject, start.body, fixed, views).images, [0])
-    return found, [cropped(image) for image in images]
+    return found
 
 
 # Masks ---------------------------------------------------------------------------------------------------------------
 
 ERRORS = (0, -1, 1, -3, 3)
 """Pixels of 256 that the masks are too large."""
-AVATARS = ("pass", "4 iterations")
 BOXES, LARGEST, NOISE = 120, 0.3, 0.03
 """Of a room: how many, their largest side in image heights, standard deviation of the noise on the photo."""
 
@@ -254,10 +217,8 @@ def masks(run: Run, people: People = People(8), sheet: Path | None = None) -> No
     Options:
     sheet: JPEG of every person: truth, masks as they are, masks that were moved
     """
-    start = people.start()
-    settings = start.settings | {"refiner": shipped_digest(SHIPPED_REFINER)}
-    cases = {str(seed): functools.partial(_masks_of, start, seed) for seed in start.seeds}
-    mean = means(list(run.rows(cases, settings, again=bool(sheet)).values()))
+    start, refiner = people.start(), {"refiner": shipped_digest(SHIPPED_REFINER)}
+    mean = means(start.rows(run, functools.partial(_masks_of, start), refiner, again=bool(sheet)))
     if sheet:
         write_triples(sheet, run.pictures, 2, ("truth", "masks 3 pixels too large", "moved to the edges"))
     both = lambda name: [f"{mean[f'{name}, {avatar}'][key]:.2f}" for key in ("psnr", "psnr_fg") for avatar in AVATARS]
@@ -266,13 +227,12 @@ def masks(run: Run, people: People = People(8), sheet: Path | None = None) -> No
         rows += [[f"{error:+d}" if error else "0", how, *both(f"{error}, {how}")] for how in ("as they are", "moved")]
     header = ["masks, pixels of 256", "used", *AVATARS, *(f"foreground PSNR, {avatar}" for avatar in AVATARS)]
     about = f"Means over {len(start.seeds)} people of the {people.split} seeds, {PHOTOS} photos of {people.size} px; PSNR in dB."
-    run.show(f"{about}\n\n{markdown_table(header, rows, 'llrrrr')}", {"settings": settings, "means": mean})
+    run.show(f"{about}\n\n{markdown_table(header, rows, 'llrrrr')}", {"settings": start.settings | refiner, "means": mean})
 
 
 def _masks_of(start, seed):
     """Scores by masks and avatar of one person; a held-out view, true, and after the iterations without and with moved masks."""
-    held = HeldOut(start.held_out.views, 0, 0)
-    subject = make_evaluation_subject(seed, start.body, [PHOTOS], start.size, held)
+    subject = start._replace(held_out=HeldOut(start.held_out.views, 0, 0)).subject(seed, [PHOTOS])
     inputs, held_out = subject.inputs(PHOTOS), subject.held_out
     view = frontal_view(inputs, held_out, list(range(held_out.view_count)))
     found, shown = {}, [held_out.images[view]]

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,22 +56,13 @@ from humangs_jax.refinement.refine import refine
 
 PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2), "alex": ("LPIPS alex", 3)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
+SECONDS = {"first": "first time, s", "compiled": "compiled, s", "first_processor": "processor: first, s"}
+SECONDS |= {"compiled_processor": "compiled, s", "load": "load"}
+IOUS = {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)}
 TABLES = (
-    (
-        ("calibrated", "uncalibrated", "poses", "moments"),
-        {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)} | PSNRS | CAMERAS,
-    ),
-    (("rooms",), {"iou": ("IoU", 3)} | PSNRS | CAMERAS),
-    (
-        ("start",),
-        {
-            "first": ("first time, s", 0),
-            "compiled": ("compiled, s", 0),
-            "first_processor": ("processor: first, s", 0),
-            "compiled_processor": ("compiled, s", 0),
-            "load": ("load", 0),
-        },
-    ),
+    (("calibrated", "uncalibrated", "poses", "moments"), IOUS | PSNRS | CAMERAS),
+    (("rooms",), {"iou": IOUS["iou"]} | PSNRS | CAMERAS),
+    (("start",), {key: (heading, 0) for key, heading in SECONDS.items()}),
 )
 """First words of rows, and the columns of their scores: heading and digits."""
 SEEDS = (4_000_100, 4_000_101, 4_000_102)
@@ -80,39 +71,20 @@ MIXES = 2
 """Of four moments."""
 
 
-class Results:
-    """Scores by label, row and frame, written after each."""
-
-    def __init__(self, file: Path, label: str) -> None:
-        self.file, settings = (
-            file,
-            {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)},
-        )
-        self.all: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-        self.rows = self.all.setdefault(label, {"settings": settings, "rows": {}})["rows"]
-
-    def measure(self, row: str, case: str, scores: Callable[[], dict[str, Any]]) -> None:
-        """Of one case of a row, unless it is there."""
-        cases = self.rows.setdefault(row, {})
-        if case not in cases:
-            cases[case] = scores()
-            write_json(self.file, self.all)
-        print(
-            f"{row}, {case}: " + ", ".join(f"{k} {v:.3f}" for k, v in cases[case].items() if isinstance(v, float)),
-            flush=True,
-        )
+Cases = Iterator[tuple[str, str, Callable[[], dict[str, Any]]]]
+"""(row, case, what measures its scores)."""
 
 
 # The package's way ---------------------------------------------------------------------------------------------------
 
-ALL = (0, 1, 2, 3)
+ALL, MASKS = (0, 1, 2, 3), ("detected", "careful")
 
 
 class Man:
     """What the package makes of the capture; each thing once. frames: by number, and what else is to be looked at by name."""
 
-    def __init__(self, data: Path, frames: Sequence[int], ways: Sequence[str], masks: Sequence[str]) -> None:
-        self.data, self.numbers, self.ways, self.masks = data, list(frames), ways, masks
+    def __init__(self, data: Path, frames: Sequence[int]) -> None:
+        self.data, self.numbers = data, list(frames)
         self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
         self.reference = reference_cameras(data)
         self.photos, self.fits, self.body = map(functools.cache, (self._photos, self._fits, self._body))
@@ -140,14 +112,9 @@ class Man:
         fitted, moments = self.fits(name, masks, views), self.frames[name].moments
         fixed = not fitted.camera_errors if moments is None else moments
         known = {"fixed_cameras": fixed, "calibrated": moments is None}
-        loose, tight = (
-            refine_capture(
-                fitted.capture,
-                keypoints=fitted.record.keypoints,
-                config=usual_config(fitted=True, tight=tight, **known),
-            ).capture
-            for tight in (False, True)
-        )
+        configs = [usual_config(fitted=True, tight=tight, **known) for tight in (False, True)]
+        refined = [refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config) for config in configs]
+        loose, tight = (each.capture for each in refined)
         return better_body(*load_weights(), loose, tight, RefineConfig(iterations=ITERATIONS, steps=0))[0]
 
 
@@ -159,12 +126,10 @@ def avatar_of(capture: Capture) -> Avatar:
 # Rows ----------------------------------------------------------------------------------------------------------------
 
 
-def calibrated(results: Results, man: Man) -> None:
+def calibrated(man: Man) -> Cases:
     """The published calibration and nothing else."""
-    cases = list(itertools.product(man.masks, man.ways, man.numbers))
-    for masks, way, number in bar(cases, desc="published calibration", unit="frame"):
-        row, made = f"calibrated, {way}, {masks}", functools.partial(_calibrated, man, number, masks, way)
-        results.measure(row, str(number), made)
+    for masks, way, number in itertools.product(MASKS, ("refine", "fit"), man.numbers):
+        yield f"calibrated, {way}, {masks}", str(number), functools.partial(_calibrated, man, number, masks, way)
 
 
 def _calibrated(man, number, masks, way):
@@ -180,11 +145,11 @@ def _calibrated(man, number, masks, way):
     return scores | {"each_psnr_fg": [row["psnr_fg"] for row in known], "each_iou_unseen": unseen}
 
 
-def poses(results: Results, man: Man) -> None:
+def poses(man: Man) -> Cases:
     """The avatar of one frame in the poses of the others."""
-    first = man.numbers[0]
-    for number in bar(man.numbers[1:], desc="other poses", unit="frame"):
-        results.measure(f"poses, avatar of frame {first}", str(number), functools.partial(_posed, man, first, number))
+    first, *others = man.numbers
+    for number in others:
+        yield f"poses, avatar of frame {first}", str(number), functools.partial(_posed, man, first, number)
 
 
 def _posed(man, first, number):
@@ -192,20 +157,16 @@ def _posed(man, first, number):
     return drawn_scores(avatar, man.body(number, "detected"), man.frames[number], ALL)
 
 
-def uncalibrated(results: Results, man: Man) -> None:
+def uncalibrated(man: Man) -> Cases:
     """Nothing is given: cameras from the person, in photos with the lenses' distortion."""
-    bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
-    for masks, number in bar(list(itertools.product(man.masks, man.numbers)), desc="no calibration", unit="frame"):
-        results.measure(
-            f"uncalibrated, {masks}",
-            str(number),
-            functools.partial(_uncalibrated, man, number, bent[number], sizes, masks),
-        )
+    bent = prepare(man.data, man.numbers, straight=False)
+    for masks, number in itertools.product(MASKS, man.numbers):
+        yield f"uncalibrated, {masks}", str(number), functools.partial(_uncalibrated, man, number, bent[number], masks)
 
 
-def _uncalibrated(man, number, frame, sizes, masks):
+def _uncalibrated(man, number, frame, masks):
     name = f"{number}_bent"
-    man.frames[name] = frame = without_calibration(frame, sizes)
+    man.frames[name] = frame = without_calibration(frame, video_sizes(man.data))
     body, reference = man.body(name, masks), man.reference.of(frame)
     scores = mean_scores(held_out(body, frame, avatar_of)) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
     return scores | _errors(frame.cameras, reference, "_start") | _errors(body.cameras, reference)
@@ -213,38 +174,37 @@ def _uncalibrated(man, number, frame, sizes, masks):
 
 def _errors(own, reference, when=""):
     degrees, centimetres = camera_errors(own, reference)
-    size = 1 / to_reference(own, reference).scale
     return {
         f"degrees{when}": float(degrees.mean()),
         f"centimetres{when}": float(centimetres.mean()),
-        f"size{when}": size,
+        f"size{when}": 1 / to_reference(own, reference).scale,
         f"each_degrees{when}": degrees.tolist(),
         f"each_centimetres{when}": centimetres.tolist(),
     }
 
 
-def moments(results: Results, man: Man) -> None:
+def moments(man: Man) -> Cases:
     """Nothing is given, and each camera's photo is of another moment."""
-    bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
-    for first in bar(range(MIXES), desc="four moments", unit="mix"):
+    bent = prepare(man.data, man.numbers, straight=False)
+    for first in range(MIXES):
         chosen = [man.numbers[(first + view) % len(man.numbers)] for view in ALL]
         frames = [bent[number] for number in chosen]
-        results.measure("moments", "+".join(map(str, chosen)), functools.partial(_moments, man, frames, sizes, first))
+        yield "moments", "+".join(map(str, chosen)), functools.partial(_moments, man, frames, first)
 
 
-def _moments(man, frames, sizes, first):
-    frame = without_calibration(one_view_each(frames), sizes)
+def _moments(man, frames, first):
+    frame = without_calibration(one_view_each(frames), video_sizes(man.data))
     man.frames[f"moments_{first}"] = frame
     ious = body_ious(man.body(f"moments_{first}", "detected"), frame.careful)
     return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments is True)}
 
 
-def rooms(results: Results, man: Man) -> None:
+def rooms(man: Man) -> Cases:
     """Synthetic people in rooms: what true cameras, masks and poses give, and what photos alone give."""
-    for seed in bar(SEEDS, desc="people in rooms", unit="person"):
+    for seed in SEEDS:
         person = functools.cache(functools.partial(person_in_rooms, seed, man.data))
         for way in ("true", "true cameras", "photos alone"):
-            results.measure(f"rooms, {way}", str(seed), functools.partial(_in_room, man, seed, person, way))
+            yield f"rooms, {way}", str(seed), functools.partial(_in_room, man, seed, person, way)
 
 
 def _in_room(man, seed, person, way):
@@ -261,12 +221,25 @@ def _in_room(man, seed, person, way):
     return scores | {"iou": float(np.mean(body_ious(body, true.masks)))} | _errors(body.cameras, true.cameras)
 
 
-def start(results: Results, man: Man) -> None:
+def start(man: Man) -> Cases:
     """The whole command."""
-    results.measure("start", str(man.numbers[0]), functools.partial(started, man.data, man.numbers[0]))
+    yield "start", str(man.numbers[0]), functools.partial(started, man.data, man.numbers[0])
 
 
-ROWS = {each.__name__: each for each in (calibrated, poses, uncalibrated, moments, rooms, start)}
+ROWS = (calibrated, poses, uncalibrated, moments, rooms, start)
+
+
+def measure(file: Path, label: str, cases: Cases) -> dict[str, Any]:
+    """Scores by label, row and case: those of the file, and of this label the missing ones, written after each."""
+    results: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    settings = {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)}
+    rows = results.setdefault(label, {"settings": settings, "rows": {}})["rows"]
+    for row, case, scores in bar(list(cases), desc="real person", unit="case"):
+        found = rows.setdefault(row, {})
+        if case not in found:
+            found[case] = scores()
+            write_json(file, results)
+    return results
 
 
 def section(results: dict[str, Any]) -> str:
@@ -280,10 +253,8 @@ def _table(results, kinds, columns):
         for row, cases in each["rows"].items():
             if row.split(",")[0] in kinds and cases:
                 means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
-                known = [means.get(key) for key in columns]
-                digits = [number for _, number in columns.values()]
-                shown = ["-" if v is None else f"{v:.{n}f}" for v, n in zip(known, digits, strict=True)]
-                rows.append([row, label, len(cases), *shown])
+                known = [(means.get(key), digits) for key, (_, digits) in columns.items()]
+                rows.append([row, label, len(cases), *("-" if v is None else f"{v:.{digits}f}" for v, digits in known)])
     header = ["row", "state", "cases", *(heading for heading, _ in columns.values())]
     return markdown_table(header, rows, "ll" + "r" * (len(header) - 2)) if rows else ""
 
@@ -296,8 +267,6 @@ def real_person(
     label: str = "now",
     rows: tuple[Literal["calibrated", "poses", "uncalibrated", "moments", "rooms", "start"], ...] = (),
     frames: tuple[int, ...] = FRAMES,
-    ways: tuple[Literal["refine", "fit"], ...] = ("refine", "fit"),
-    masks: tuple[Literal["detected", "careful"], ...] = ("detected", "careful"),
     pictures: Path | None = None,
 ) -> None:
     """A real man from four photos of a moment: how well the body fills his masks, how like him the avatar is where no photo was.
@@ -315,17 +284,15 @@ def real_person(
     label: of this state of the package
     rows: default: all
     frames: of the videos, 0 to 99
-    ways: of finding the body
-    masks: that photos are cut out by
     pictures: JPEG of the avatar from all sides, and walking
     """
     if not all(0 <= frame < 100 for frame in frames):
         raise ValueError("--frames: expected 0 to 99")
     enable_compile_cache()
-    results, man = Results(out, label), Man(data, frames, ways, masks)
-    for row in rows or ROWS:
-        ROWS[row](results, man)
+    man = Man(data, frames)
+    wanted = [each for each in ROWS if not rows or each.__name__ in rows]
+    results = measure(out, label, itertools.chain.from_iterable(each(man) for each in wanted))
     if pictures:
         body = man.body(man.numbers[0], "detected")
         draw_sheet(avatar_of(body), body, pictures)
-    run.show(section(results.all), results.all)
+    run.show(section(results), results)

@@ -9,7 +9,7 @@ import functools
 import itertools
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -125,12 +125,11 @@ def matmul_program(dtype: str) -> tuple[Callable[[], Any], float]:
     return lambda: jax.block_until_ready(product(a, b)), 2.0 * rows * inner * columns
 
 
-def configured(preset: str, size: int, dtype: str = "auto") -> HumanGSConfig:
+def configured(preset: str, size: int) -> HumanGSConfig:
     """A preset for photos of that size, in the dtype that suits the machine. Raises ValueError for an unknown preset."""
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
-    if dtype == "auto":
-        dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+    dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
     return PRESETS[preset]().with_conventions(image_size=size).with_runtime(dtype=dtype)
 
 
@@ -145,7 +144,6 @@ def reconstruction_benchmark(
     preset: str = "published",
     views: int = 4,
     size: int = 256,
-    dtype: Literal["auto", "float32", "bfloat16"] = "auto",
     repeats: int = 3,
     memory: tuple[int, ...] = (1, 4, 8, 16),
     memory_size: int = 512,
@@ -159,12 +157,11 @@ def reconstruction_benchmark(
     Options:
     preset: published, paper, small or tiny
     size: side of the photos, pixels
-    dtype: auto: float32 on a CPU
     repeats: timed iterations
     memory: numbers of views to analyse the memory for
     memory_size: side of the photos there
     """
-    config, large = configured(preset, size, dtype), configured(preset, memory_size, dtype)
+    config, large = configured(preset, size), configured(preset, memory_size)
     settings = {"preset": preset, "views": views, "size": size, "dtype": config.runtime.dtype, "repeats": repeats}
     cases = {"time": functools.partial(benchmark, config, views, size, repeats)}
     for name, count in itertools.product(TOKENS, memory):

@@ -1,7 +1,6 @@
 """What refinement gains, and README's tables, which are made of it."""
 
 import dataclasses
-import functools
 import itertools
 import json
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from experiments.harness import Run, entry, figure, means
 from experiments.pictures import cropped, details, frontal_view, write_triples
 from experiments.results import REPOSITORY, markdown_table, significant
-from experiments.subjects import TASKS, People, make_evaluation_subject, score_tasks, shipped_digest, task_views
+from experiments.subjects import TASKS, People, score_tasks, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
 from humangs_jax.evaluation.cases import draw_views
@@ -65,23 +64,21 @@ def refinement(
     details_sheet: the same of faces, hands, hems and shoes
     """
     start = people.start()
-    settings = start.settings | {"seconds": seconds, "sizes": sizes, "views": views, "off": off}
-    settings |= {"iterations": iterations}
+    settings: dict[str, Any] = {"seconds": seconds, "sizes": sizes, "views": views, "off": off, "iterations": iterations}
     settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
     hows = {f"{n} iterations, Adam" if n else "Adam": RefineConfig(iterations=n) for n in iterations}
 
     def measure(seed):
         row, pictures = {}, None
         for size in sizes:
-            subject = make_evaluation_subject(seed, start.body, views, size, start.held_out)
+            subject = start.subject(seed, views, size)
             for count, wrong, how in itertools.product(views, off, hows):
                 cell, drawn = _refined(start, with_body_off(subject, wrong), count, hows[how], seconds)
                 row[f"{size} {count} {wrong:g} {how}"] = cell
                 pictures = drawn if count == max(views) else pictures
         return row, pictures
 
-    cases = {str(seed): functools.partial(measure, seed) for seed in start.seeds}
-    rows = list(run.rows(cases, settings, again=bool(sheet or details_sheet)).values())
+    rows, settings = start.rows(run, measure, settings, bool(sheet or details_sheet)), start.settings | settings
     numbers = refinement_means(rows)
     run.show(refinement_section(numbers, settings, len(rows)), {"settings": settings, "means": numbers, "people": len(rows)})
     if sheet:

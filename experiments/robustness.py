@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import math
 from collections.abc import Callable
 from typing import Any, Literal
@@ -131,7 +130,7 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
     array.
 
     Options:
-    cases: words; only cases whose names have one of them; the other rows of the table stay
+    cases: words; only cases whose names have one of them
     """
     (subject,), network = changes.subjects(1), load_weights()
 
@@ -142,9 +141,6 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
 
     chosen = [name for name in CASES if not cases or any(word in name for word in cases)]
     numbers = run.rows({name: functools.partial(measure, CASES[name]) for name in chosen})
-    if cases and run.publish:
-        stored = json.loads((REPOSITORY / "docs/results" / f"{run.table}.json").read_text())["numbers"] | numbers
-        numbers = {name: stored[name] for name in CASES if name in stored}
     rows = []
     for name, row in numbers.items():
         if "error" in row:

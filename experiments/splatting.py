@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import gc
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -223,7 +222,6 @@ def splatting_tradeoff(
     repeats: int = 7,
     only: tuple[str, ...] = (),
     image: Path | None = None,
-    measured: Path | None = None,
 ) -> None:
     """What each knob of the splatting renderer gains in time and costs in accuracy, on the shipped person.
 
@@ -236,17 +234,13 @@ def splatting_tradeoff(
     repeats: timed iterations
     only: knobs to measure (also: hidden, combined, preset)
     image: draw the Pareto front here
-    measured: docs/results/splatting_tradeoff.json of an earlier run, for the image alone
     """
-    if measured:
-        result = json.loads(measured.read_text())["numbers"]
-    else:
-        scene = demo_scene(size)
-        start = functools.cache(lambda: (exact_outputs(scene), compiled(scene, DEFAULT_CONFIG)[0]))
-        cases = {each.label: functools.partial(measure, scene, start, each, repeats) for each in settings_of(scene, only)}
-        rows = run.rows({"exact": lambda: measure_exact(*start(), repeats)} | cases, {"size": size, "repeats": repeats})
-        result = {"size": size, "gaussians": len(scene.gaussians.means), "settings": list(rows.values())}
-        run.show(knobs_table(result), result)
+    scene = demo_scene(size)
+    start = functools.cache(lambda: (exact_outputs(scene), compiled(scene, DEFAULT_CONFIG)[0]))
+    cases = {each.label: functools.partial(measure, scene, start, each, repeats) for each in settings_of(scene, only)}
+    rows = run.rows({"exact": lambda: measure_exact(*start(), repeats)} | cases, {"size": size, "repeats": repeats})
+    result = {"size": size, "gaussians": len(scene.gaussians.means), "settings": list(rows.values())}
+    run.show(knobs_table(result), result)
     if image:
         plot(image, result)
 

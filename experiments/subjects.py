@@ -9,8 +9,9 @@ shows; means over views, under the protocol "humangs".
 """
 
 import dataclasses
+import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -19,18 +20,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.harness import Run
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
 from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
-from humangs_jax.losses.loss_networks import installed_lpips, load_loss_networks
+from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
@@ -56,10 +57,7 @@ class People:
     first: index of the first person within the split
     split: seeds of the people; choices are made on "validation"
     weights: weights file; the shipped ones if not given
-    tokens: patches that the network looks at; as it was trained if not given
-    lpips_backbone: weights of the network under LPIPS; those of the extra `lpips` if not given
-    lpips_heads: heads of LPIPS, where the backbone's file does not have them
-    lpips_net: which network that is
+    lpips_net: network under LPIPS, of the extra `lpips`
     """
 
     subjects: int = 8
@@ -70,19 +68,15 @@ class People:
     first: int = 0
     split: Literal["test", "validation"] = "test"
     weights: Path | None = None
-    tokens: Literal["all", "foreground"] | None = None
-    lpips_backbone: Path | None = None
-    lpips_heads: Path | None = None
-    lpips_net: Literal["vgg", "alex", "squeeze"] = "alex"
+    lpips_net: Literal["vgg", "alex"] = "alex"
 
     def start(self) -> "Start":
         """Reads what is needed. Raises: ValueError that names the option that is out of range."""
         if min(self.subjects, self.held_out, self.pose_views) < 1 or min(self.first, self.poses) < 0:
             raise ValueError("--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0")
-        backbone = self.lpips_backbone or installed_lpips().get(self.lpips_net)
-        lpips = load_loss_networks(None, backbone, self.lpips_heads, self.lpips_net).lpips
+        backbone = installed_lpips().get(self.lpips_net)
+        lpips = load_lpips(self.lpips_net) if backbone else None
         body, (variables, config) = load_body(), load_weights(self.weights)
-        config = config.with_runtime(tokens=self.tokens)
         seeds = list(seeds_of(self.split, self.first, self.subjects))
         settings = {
             "weights": file_digest(self.weights) if self.weights else shipped_digest(SHIPPED),
@@ -95,7 +89,7 @@ class People:
             "ring": RING,
             "generator": GENERATOR_VERSION,
             "lpips_net": self.lpips_net if lpips else None,
-            "lpips_weights": file_digest(backbone) if lpips and backbone else None,
+            "lpips_weights": file_digest(backbone) if backbone else None,
         }
         held_out = HeldOut(self.held_out, self.poses, self.pose_views)
         return Start(body, variables, config, seeds, held_out, self.size, lpips, settings)
@@ -112,6 +106,17 @@ class Start(NamedTuple):
     size: int
     lpips: Lpips | None
     settings: dict[str, Any]
+
+    def subject(self, seed: int, counts: Sequence[int], size: int | None = None) -> "EvaluationSubject":
+        """The person of a seed with what so many photos need, see `make_evaluation_subject`."""
+        return make_evaluation_subject(seed, self.body, counts, size or self.size, self.held_out)
+
+    def rows(
+        self, run: Run, measure: Callable[[int], Any], settings: Mapping[str, Any] | None = None, again: bool = False
+    ) -> list[Any]:
+        """What `measure` gives of the seed of each person, see `Run.rows`."""
+        cases = {str(seed): functools.partial(measure, seed) for seed in self.seeds}
+        return list(run.rows(cases, self.settings | dict(settings or {}), again).values())
 
     def about(self) -> str:
         """What was measured, in one line."""
@@ -235,22 +240,6 @@ def _as_stored(capture):
     return dataclasses.replace(capture, **rounded)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Drawn:
-    """The held-out views of a person as drawn: ours (v, h, w, 3) and the vertex-color baseline (v, h, w, 3), in [0, 1]."""
-
-    ours: np.ndarray
-    painted: np.ndarray
-
-
-def draw_person(variables: Variables, config: HumanGSConfig, subject: EvaluationSubject, count: int) -> Drawn:
-    """Reconstruct from that number of photos, and paint the body with the same ones."""
-    inputs = subject.inputs(count)
-    avatar = reconstruct(variables, config, inputs)
-    ours = draw_views(avatar, subject.held_out).images
-    return Drawn(ours, draw_painted_body(painted_body(inputs), subject.held_out))
-
-
 def task_views(held_out: Capture) -> dict[str, np.ndarray]:
     """Indices of the held-out views by task: those in the pose of the photos, which is frame 0, and the others."""
     still = np.asarray(held_out.frames) == 0
@@ -269,10 +258,3 @@ def score_tasks(
     rows = list(score_views(drawn, held_out, protocol, alpha, {} if lpips is None else {net: lpips}))
     means = {task: mean_scores(rows[i] for i in views) for task, views in task_views(held_out).items() if len(views)}
     return {task: scores | {"lpips": scores.pop(f"lpips_{net}")} for task, scores in means.items()}
-
-
-def score_person(drawn: Drawn, held_out: Capture, lpips: Lpips | None = None) -> dict[str, Scores]:
-    """Scores by task, those of the vertex-color baseline beside ours under names with the prefix "baseline_"."""
-    ours, painted = (score_tasks(x, held_out, lpips) for x in (drawn.ours, drawn.painted))
-    compared = ("psnr", "ssim", "psnr_fg", "lpips")
-    return {task: ours[task] | {f"baseline_{name}": painted[task][name] for name in compared} for task in ours}

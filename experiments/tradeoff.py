@@ -54,8 +54,8 @@ SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; novel poses; views of each."""
 PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
-FRAMES = 10
-"""Timed iterations of drawing a frame."""
+FRAMES, ITERATIONS = 10, 2
+"""Timed iterations of drawing a frame, and of making an avatar."""
 QUALITY, NET = ("psnr", "ssim", "psnr_fg", "lpips"), "alex"
 """LPIPS of this network, where the extra `lpips` is installed."""
 
@@ -66,7 +66,6 @@ def tradeoff(
     out: Path,
     subjects: int = 2,
     people: Path | None = None,
-    iterations: int = 2,
     only: tuple[str, ...] = (),
     image: Path | None = None,
     front: bool = False,
@@ -79,7 +78,6 @@ def tradeoff(
     out: JSON of the points; those that are there are not measured again
     subjects: how many people
     people: folder where rendered people are kept for later runs
-    iterations: timed iterations of making an avatar
     only: knobs to measure
     image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
     front: write humangs_jax/assets/front.json, where `humangs tune` finds it
@@ -94,7 +92,7 @@ def tradeoff(
             rows[each.name] = {"what": described(each), "people": []}
     missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
     if missing:
-        bench = Bench(subjects, people, iterations)
+        bench = Bench(subjects, people)
         # all of one person, then the next: times are of the first
         for done, (i, each) in enumerate(bar(missing, desc="points", unit="point")):
             if done % 20 == 19:
@@ -157,12 +155,12 @@ def random_start(avatar: Any, seed: int) -> Any:
 class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
-    def __init__(self, subjects: int, people: Path | None, iterations: int = 2):
+    def __init__(self, subjects: int, people: Path | None):
         self.subjects, (self.variables, self.config) = subjects, load_weights()
         body = load_body()
         seeds = seeds_of("tradeoff", 0, subjects)
         self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
-        self.default, self.iterations = DEFAULT, iterations
+        self.default = DEFAULT
         self.lpips = load_lpips(NET) if installed_lpips() else None
         self.kept: dict[Any, Any] = {}
         self.default_avatar = self.made(DEFAULT, 0)
@@ -246,7 +244,7 @@ class Bench:
         settings, usual = point.settings, self.default.settings
         same = (settings.views, settings.runtime) == (usual.views, usual.runtime)
         pairs = []
-        for _ in range(0 if same and point is not self.default else self.iterations):
+        for _ in range(0 if same and point is not self.default else ITERATIONS):
             pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
         ratio = 0.0 if point.start == "random colors" else 1.0 if point is self.default else float(own / default)
@@ -264,10 +262,10 @@ class Bench:
         photos, avatar = self.photos(settings), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
         run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
-        default = [self.default_make_ms() for _ in range(self.iterations)]
+        default = [self.default_make_ms() for _ in range(ITERATIONS)]
         with peak_memory() as peak:
             own = timed(lambda: run(settings.refinement))[1]
-        default += [self.default_make_ms() for _ in range(self.iterations)]
+        default += [self.default_make_ms() for _ in range(ITERATIONS)]
         return own / float(np.median(default)), peak[0]
 
     def frame_times(self, point, drawn) -> dict[str, Any]:
@@ -293,7 +291,7 @@ class Bench:
         one = held_out.select([0])
         colors = painted_body(photos)
         draw_painted_body(colors, one)
-        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.iterations)]
+        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(ITERATIONS)]
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         next(usual)
         frames = [(timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)]

@@ -22,7 +22,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.network.weights import load_weights, save_weights
-from humangs_jax.people.bank import build_bank, load_bank
+from humangs_jax.people.bank import build_bank
 from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.people.subject import seeds_of
 from humangs_jax.training import config as presets
@@ -35,6 +35,11 @@ FOR_EVER = 100_000_000
 WARM_UP, EMA, LOGGED, SAVED, RESERVE = 40, 0.998, 20, 90.0, 6.0
 """Steps until the full learning rate; decay of the average; steps between lines of the log; seconds between weights on disk;
 seconds that the last ones may take."""
+FIRST, SEED = 1000, 0
+"""Of the training seeds; of order and views."""
+LPIPS, DISPLACED, START_SHARE = 0.1, 0.5, 0.5
+"""Weight of LPIPS (AlexNet) in the loss; share of the examples whose body is displaced to the silhouettes of the clothes; share
+of the first weights in OUT/mean.safetensors, the rest are the trained ones (`train_shipped.py`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,29 +50,15 @@ class Clock:
     init_weights: where to start; default: the shipped ones
     minutes: in all, with the people and the compilation
     people: of the training seeds, rendered anew for every step
-    first: of these seeds
-    bank: file of a bank with displacements instead
     batch: people a step
-    at_once: of these, the rest follow
     learning_rate: the peak
-    lpips: weight of LPIPS (AlexNet) in the loss
-    displaced: share of the examples whose body is displaced to the silhouettes of the clothes
-    seed: of order and views
-    start_share: of the first weights in OUT/mean.safetensors, the rest are the trained ones (`train_shipped.py`)
     """
 
     init_weights: Path | None = None
     minutes: float = 8.0
     people: int = 450
-    first: int = 1000
-    bank: Path | None = None
     batch: int = 8
-    at_once: int = 8
     learning_rate: float = 3e-4
-    lpips: float = 0.1
-    displaced: float = 0.5
-    seed: int = 0
-    start_share: float = 0.5
 
 
 @entry
@@ -85,12 +76,12 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     state, average = (init_state(config, variables) for _ in range(2))
     average = average.params
     make = functools.partial(build_bank, body=body, split="train", displaced=carrier)
-    seeds, processes = seeds_of("train", how.first, how.people), max(1, (os.cpu_count() or 1) - 1)
+    seeds, processes = seeds_of("train", FIRST, how.people), max(1, (os.cpu_count() or 1) - 1)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        wanted = pool.submit(make, seeds, processes=processes) if how.bank is None else pool.submit(load_bank, how.bank)
+        wanted = pool.submit(make, seeds, processes=processes)
         examples = examples_of(config, how)
         batch = jax.eval_shape(examples, make(seeds[:1]), 0)
-        given = carrier, networks, seed_numbers(how.seed)
+        given = carrier, networks, seed_numbers(SEED)
         step = stepper(config).lower(state, average, batch, *given, 1.0).compile()
         compiled = clock()
         print(f"compiled after {compiled:.0f} s", flush=True)
@@ -116,7 +107,7 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     if not done:
         raise ValueError(f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left for training")
     trained = state_variables(average, state)
-    mean = jax.tree.map(lambda a, b: how.start_share * a + (1 - how.start_share) * b, variables, trained)
+    mean = jax.tree.map(lambda a, b: START_SHARE * a + (1 - START_SHARE) * b, variables, trained)
     for name, made in {"weights": trained, "mean": mean}.items():
         save_weights(out / f"{name}.safetensors", made, model, "float16")
     row = {"steps": done, "step": 1e3 * (clock() - start) / done, "people a second": how.batch * done / (clock() - start)}
@@ -130,11 +121,11 @@ def configured(how: Clock) -> TrainConfig:
     config = presets.small()
     return dataclasses.replace(
         config,
-        loss=dataclasses.replace(config.loss, lpips=how.lpips),
+        loss=dataclasses.replace(config.loss, lpips=LPIPS),
         optimizer=dataclasses.replace(config.optimizer, learning_rate=how.learning_rate, warmup_steps=0),
         steps=FOR_EVER,
         batch_size=how.batch,
-        microbatch_size=how.at_once,
+        microbatch_size=how.batch,
         ema_decay=None,
     )
 
@@ -150,13 +141,13 @@ def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
         target_size=config.target_size,
         mixed_pose_share=views.mixed_pose_share,
         depths=True,
-        displaced_share=how.displaced,
+        displaced_share=DISPLACED,
     )
     if jax.default_backend() != "cpu":
         drawn = dataclasses.replace(drawn, views_at_once=drawn.input_views + drawn.target_views, pixels_per_step=1 << 30)
 
     def examples(bank, step):
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(how.seed), step), how.batch)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), step), how.batch)
         return jax.lax.map(lambda key: on_the_fly_example(bank, key, drawn), keys)
 
     return examples

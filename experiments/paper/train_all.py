@@ -1,10 +1,7 @@
 """Trains the variants of the bench one after the other, and scores them."""
 
 import itertools
-import os
-import signal
 import sys
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -56,11 +53,6 @@ VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
 def paper(
     run: Run,
     out: Path,
-    budget: float | None = None,
-    round_steps: int = ROUND,
-    people: int = 192,
-    test_people: int = 32,
-    seeds: int = SEEDS,
     only: tuple[str, ...] = (),
     train: bool = True,
     quick: bool = False,
@@ -73,20 +65,12 @@ def paper(
 
     Options:
     out: folder of the people, the runs and results.json
-    budget: hours that this call may take; default: no limit
-    round_steps: of each round; another number is another OUT
-    people: to train on; as many cost 3 minutes
-    test_people: to compare on
-    seeds: of each variant
     only: names of the variants to train; default: all
     train: --no-train shows what is done
     quick: 4 people, rounds of 4 steps, two variants
     """
-    if round_steps < 4 or people < 1 or test_people < 2 or seeds < 1 or (budget is not None and budget <= 0):
-        raise ValueError("--round-steps must be at least 4, --test-people 2, --people and --seeds 1, --budget positive")
-    if quick:
-        round_steps, people, test_people, seeds, only = 4, 4, 2, 1, only or (REFERENCE, "lvsm")
-    known = variants()
+    round_steps, people, test_people, seeds = (4, 4, 2, 1) if quick else (ROUND, 192, 32, SEEDS)
+    known, only = variants(), only or ((REFERENCE, "lvsm") if quick else ())
     if unknown := [name for name in only if name not in known]:
         raise ValueError(f"--only {unknown[0]!r}: expected names of {', '.join(known)}")
     settings = {"round_steps": round_steps, "people": people, "test_people": test_people}
@@ -94,10 +78,6 @@ def paper(
     report = kept(path, settings)
     if train:
         enable_compile_cache(out / "cache")
-        if budget is not None:
-            timer = threading.Timer(3600 * budget, os.kill, (os.getpid(), signal.SIGTERM))
-            timer.daemon = True
-            timer.start()
         write_plain(place / "validation", "validation", min(VALIDATED, test_people), VIEWS, HELD_OUT_VIEWS)
         write_plain(place / "test", "test", test_people, VIEWS, HELD_OUT_VIEWS)
         write_plain(place / "near", "test", test_people, VIEWS, HELD_OUT_VIEWS, near=True)

@@ -40,10 +40,10 @@ def write_triple(folder, options, change=lambda arrays: None):
     return folder / "a.pt"
 
 
-def run(checkpoint, dtype="float32", *options):
+def run(checkpoint, dtype="float32"):
     """Exit status, and the column of the result."""
     out = checkpoint.with_name("out.json")
-    given = [checkpoint, "--dtypes", dtype, *options, "--json", out]
+    given = [checkpoint, "--dtypes", dtype, "--json", out]
     code = call(check_parity.parity, [str(each) for each in given])
     return code, json.loads(out.read_text())["numbers"]["parity_stages"][f"{dtype}, {checkpoint.stem}"]
 
@@ -73,10 +73,9 @@ def test_every_option_of_the_network(name, tmp_path):
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_other_precisions(dtype, tmp_path):
     checkpoint = write_triple(tmp_path, dataclasses.replace(SMALL, layers=2, class_token=True))
-    code, result = run(checkpoint, dtype, *(["--render"] if dtype == "bfloat16" else []))
+    code, result = run(checkpoint, dtype)
     assert code == 0 and result["bound"] == {"float32": 2e-5, "bfloat16": 5e-2}[dtype]
     if dtype == "bfloat16":
-        assert 45 < result["render_psnr"] < 200  # dB; equal images would be 300
         assert result["stages"]["mid_encoder_out"] > 1e-4  # else it were float32
         assert result["stages"]["out_ray_d"] < 1e-6
 
