@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments import changes
 from experiments.harness import Run, entry
-from experiments.results import REPOSITORY, markdown_table
+from experiments.results import markdown_table
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.reconstruct import fit_buffers
 from humangs_jax.body.library import load_body
