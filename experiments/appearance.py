@@ -81,7 +81,7 @@ def appearance(
     """
     start = people.start()
     networks = {net: load_lpips(net) for net in NETS}
-    settings = {"sizes": sizes, "off": off, "variants": tuple(VARIANTS), "refiner": shipped_digest(SHIPPED)}
+    settings: dict[str, Any] = {"sizes": sizes, "off": off, "variants": tuple(VARIANTS), "refiner": shipped_digest(SHIPPED)}
     settings |= {"first_refiner": first_refiner and file_digest(first_refiner)}
     settings |= {"first_network": first_network and file_digest(first_network)}
     first = load_weights(first_network)[0] if first_network else start.variables
