@@ -16,7 +16,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS
 from humangs_jax.data.motion import load_motion
-from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
+from humangs_jax.fitting.landmark_fit import fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
 from humangs_jax.fitting.triangulation import triangulate, triangulate_robustly
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -166,7 +166,7 @@ def _errors(count, frames, setting):
     kind, views, noise, outliers = setting
     model, people = _model(kind), _people(kind, views, count, frames)
     seen = observe(people, FIRST, noise, outliers, model)
-    fit_all = jax.vmap(lambda own: fit_landmarks(model, own, FitConfig()))
+    fit_all = jax.vmap(lambda own: fit_landmarks(model, own))
     times = [time.perf_counter()]
     for _ in range(2):
         fit = jax.block_until_ready(fit_all(seen))
@@ -264,8 +264,7 @@ def measure(model, people, name: str, smoothness: float) -> dict:
     """Mean errors of the frames left alone, of the spoilt ones and of accelerations, millimetres; the acceleration held to."""
     _, _, spoilt = CASES[name]
     seen = spoiled(model, people, name)
-    config = FitConfig(smoothness=smoothness)
-    fit = jax.vmap(lambda own: fit_landmarks(model, own, config))(seen)
+    fit = jax.vmap(lambda own: fit_landmarks(model, own, smoothness))(seen)
     truth = np.stack([case.joints for case in people])
     errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1).mean(-1)
     bad = np.isin(np.arange(FRAMES), spoilt)

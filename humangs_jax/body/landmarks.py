@@ -31,7 +31,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.joints import FINGERS
-from humangs_jax.body.model import EXACT, BodyModel, BodyPose, SurfacePoints, joint_transforms, pose_features, pose_points, shaped
+from humangs_jax.body.model import (
+    EXACT,
+    BodyModel,
+    BodyPose,
+    SurfacePoints,
+    joint_transforms,
+    pose_features,
+    pose_points,
+    shaped,
+    surface_points,
+)
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
@@ -102,6 +112,8 @@ CARRIES = 0.1
 """A joint moves a point that has at least this share of its weight from it."""
 MIDLINE = 0.006
 """Half-width of the middle of the face, metres."""
+FOOT = {"foot_index": (0.0, 1.0), "big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
+"""The direction in which landmarks of the foot are farthest: outwards and forwards."""
 
 
 @pytree_dataclass
@@ -187,9 +199,7 @@ def landmark_model(
             row[joints + vertices.index(source) if source >= 0 else -1 - source] += 1 / len(found)
         if name in moved:
             row[joints + len(vertices) + placed.index(moved[name])] = 1.0
-    points = _concatenated(
-        [_surface_points(body, np.asarray(vertices, np.int32)), *(_placed(body, finder, place) for place in placed)]
-    )
+    points = _concatenated([_rows(surface_points(body), vertices), *(_placed(body, finder, place) for place in placed)])
     return LandmarkModel(
         joints=_regressed(body, body.template),
         joint_directions=_regressed(body, body.shape_directions),
@@ -211,14 +221,8 @@ def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
-def _surface_points(body: BodyModel, vertices: Int[np.ndarray, " p"]) -> SurfacePoints:
-    """Vertices (p,) as they are."""
-    return SurfacePoints(
-        body.template[vertices],
-        body.shape_directions[vertices],
-        None if body.pose_directions is None else body.pose_directions[vertices],
-        body.skinning_weights[vertices],
-    )
+def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> SurfacePoints:
+    return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
 
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
@@ -235,9 +239,9 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 
 def _placed(body: BodyModel, finder: "_Finder", place: Place) -> SurfacePoints:
     """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
-    sources = finder.find(place.base)
-    points = _concatenated([_surface_points(body, np.asarray([s])) if s >= 0 else _joint_point(body, -1 - s) for s in sources])
-    mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), points)
+    every, sources = surface_points(body), finder.find(place.base)
+    points = [_rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source) for source in sources]
+    mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), _concatenated(points))
     weights = mean.weights
     if place.joints:
         carriers = np.asarray([finder.index[joint] for joint in place.joints])
@@ -304,40 +308,41 @@ class _Finder:
         """The sources whose mean is the landmark; none if the body lacks it."""
         try:
             return self._find(name)
-        except (KeyError, _NoVertex):
+        except (KeyError, ValueError):  # a joint that it lacks, or no vertex where a rule looks
             return []
 
     def _find(self, name: str) -> list[int]:
         joint = lambda x: -1 - self.index[x]
-        middles = {"neck": "shoulder", "mid_hip": "hip"}
-        if name in middles:
-            return [joint(f"{side}_{middles[name]}") for side in SIDES]
-        if name in ("nose", "face_30"):
-            return [self._nose()]
-        if name == "face_8":
-            return [self._on_midline(lambda p: -p[:, 1], highest=self.joints[self.index["jaw"], 1])]
-        if name == "face_27":
-            height = self._eyes()[1]
-            return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
-        if name == "jaw":
-            return [joint(name)]
-        side, _, part = name.partition("_")
-        if side not in SIDES:
-            raise KeyError(name)
-        if part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "eye"):
-            return [joint(name)]
-        if part == "hand_root":
-            return [joint(f"{side}_wrist")]
-        if part == "ear":
-            return [self._ear(SIDES[side])]
-        if part in ("foot_index", "big_toe", "small_toe", "heel"):
-            return [self._foot(side, part)]
-        finger, _, knuckle = part.partition("_")
-        if finger not in FINGERS:
-            raise KeyError(name)
-        if knuckle == "tip":
-            return [self._finger_tip(f"{side}_{finger}")]
-        return [joint(f"{side}_{finger}{int(knuckle)}")]
+        match name.split("_"):
+            case ["neck"]:
+                return [joint(f"{side}_shoulder") for side in SIDES]
+            case ["mid", "hip"]:
+                return [joint(f"{side}_hip") for side in SIDES]
+            case ["nose"] | ["face", "30"]:
+                low, high = self.joints[self.index["jaw"], 1], self._eyes()[1]
+                return [self._best(self._head(low, high), lambda p: p[:, 2])]
+            case ["face", "8"]:
+                return [self._on_midline(lambda p: -p[:, 1], highest=self.joints[self.index["jaw"], 1])]
+            case ["face", "27"]:
+                height = self._eyes()[1]
+                return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
+            case ["jaw"] | ["left" | "right", "shoulder" | "elbow" | "wrist" | "hip" | "knee" | "ankle" | "eye"]:
+                return [joint(name)]
+            case ["left" | "right" as side, "hand", "root"]:
+                return [joint(f"{side}_wrist")]
+            case ["left" | "right" as side, "ear"]:
+                eyes = self._eyes()[1]
+                return [self._best(self._head(eyes - 0.06, eyes + 0.03), lambda p: SIDES[side] * p[:, 0])]
+            case ["left" | "right" as side, *part] if "_".join(part) in FOOT:
+                outward, forward = FOOT["_".join(part)]
+                foot = self._segment(f"{side}_ankle", f"{side}_foot")
+                return [self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])]
+            case ["left" | "right" as side, finger, "tip"] if finger in FINGERS:
+                middle, last = (self.joints[self.index[f"{side}_{finger}{k}"]] for k in (2, 3))
+                return [self._best(self._segment(f"{side}_{finger}3"), lambda p: p @ (last - middle))]
+            case ["left" | "right" as side, finger, "1" | "2" | "3" as knuckle] if finger in FINGERS:
+                return [joint(f"{side}_{finger}{knuckle}")]
+        raise KeyError(name)
 
     def _segment(self, *joints: str) -> Int[np.ndarray, " n"]:
         """Vertices that belong to some joints together; joints that the body lacks are left out."""
@@ -345,17 +350,16 @@ class _Finder:
         return np.flatnonzero(owned > MEMBER)
 
     def _best(self, vertices: Int[np.ndarray, " n"], score: Score) -> int:
-        if not len(vertices):
-            raise _NoVertex
         return int(vertices[np.argmax(score(self.template[vertices]))])
 
     def _eyes(self) -> Float[np.ndarray, "3"]:
         return self.joints[[self.index["left_eye"], self.index["right_eye"]]].mean(0)
 
-    def _nose(self) -> int:
+    def _head(self, low: float, high: float) -> Int[np.ndarray, " n"]:
+        """Vertices of the head between two heights."""
         head = self._segment("head", "jaw")
-        height, low, high = self.template[head, 1], self.joints[self.index["jaw"], 1], self._eyes()[1]
-        return self._best(head[(height > low) & (height < high)], lambda p: p[:, 2])
+        height = self.template[head, 1]
+        return head[(height > low) & (height < high)]
 
     def _on_midline(self, score: Score, highest: float = np.inf) -> int:
         """The best vertex of the front of the face's middle."""
@@ -363,22 +367,3 @@ class _Finder:
         p = self.template[head]
         front = p[:, 2] > 0.5 * (self._eyes()[2] + p[:, 2].max()) - 0.02
         return self._best(head[front & (np.abs(p[:, 0]) < MIDLINE) & (p[:, 1] < highest)], score)
-
-    def _ear(self, sign: float | int) -> int:
-        head, eyes = self._segment("head", "jaw"), self._eyes()[1]
-        height = self.template[head, 1]
-        return self._best(head[(height > eyes - 0.06) & (height < eyes + 0.03)], lambda p: sign * p[:, 0])
-
-    def _foot(self, side: str, part: str) -> int:
-        directions = {"foot_index": (0.0, 1.0), "big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
-        outward, forward = directions[part]
-        foot = self._segment(f"{side}_ankle", f"{side}_foot")
-        return self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])
-
-    def _finger_tip(self, finger: str) -> int:
-        along = self.joints[self.index[f"{finger}3"]] - self.joints[self.index[f"{finger}2"]]
-        return self._best(self._segment(f"{finger}3"), lambda p: p @ along)
-
-
-class _NoVertex(Exception):
-    """A body without a vertex where a rule looks."""

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import LARGEST, checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass
@@ -57,19 +57,15 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
     Examples:
         >>> body = hg.load_body("SMPLX_NEUTRAL.npz")
     """
-    if path is None:
+    with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as shipped:
+        file = shipped if path is None else Path(path)
+        with reading(file, "body model file"), open_file(file) as content:
+            own = content.read(2) == b"PK" and "format" in read_npz(file, lambda name: name == "format")[0]
+        if not own:
+            return load_smplx(file, **smplx_options)
         if smplx_options:
-            raise TypeError(f"options of SMPL-X files do not apply to the shipped body: {sorted(smplx_options)}")
-        with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as file:
-            return read_body(file)
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such body model file")
-    if is_body_file(path):
-        if smplx_options:
-            raise TypeError(f"{path}: options of SMPL-X files do not apply to this file: {sorted(smplx_options)}")
-        return read_body(path)
-    return load_smplx(path, **smplx_options)
+            raise TypeError(f"{file}: options of SMPL-X files do not apply to this file: {sorted(smplx_options)}")
+        return read_body(file)
 
 
 def _indices(array: np.ndarray) -> np.ndarray:
@@ -130,61 +126,47 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     write_npz(path, arrays)
 
 
-def is_body_file(path: str | Path) -> bool:
-    """Whether a file is an npz with this format's mark."""
-    with reading(path, "body model file"), open_file(path) as file:
-        if file.read(2) != b"PK":
-            return False
-    return "format" in read_npz(path, lambda name: name == "format")[0]
-
-
 def read_body(path: str | Path) -> BodyModel:
     """Read what `save_body` wrote. Raises: ValueError, naming the file and the key, if it is something else."""
     with reading(path, "body file"):
-        return _read_body(path)
-
-
-def _read_body(path: str | Path) -> BodyModel:
-    arrays, pickled = read_npz(path)
-    if str(arrays.get("format")) != FORMAT:
-        raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
-    if pickled:
-        raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
-    if missing := sorted(KEYS - set(arrays)):
-        raise Refused(f"key '{missing[0]}' is missing")
-    parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]
-    check_joints(parents, joint_names)
-    joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
-    check_array("template", arrays["template"], (vertices, 3), -LARGEST, LARGEST)
-    check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST)
-    check_indices("faces", arrays["faces"], (None, 3), vertices)
-    directions = np.moveaxis(arrays["shape_directions"], 0, -1)
-    if directions.dtype == np.int16:
-        directions = directions * DIRECTION_STEP
-    uvs = arrays.get("uvs")
-    if uvs is not None:
-        check_array("uvs", uvs, (None, 2))
-        check_indices("uv_faces", arrays["uv_faces"], (len(arrays["faces"]), 3), len(uvs))
-        uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
-    for name in {"collapse_order", "collapse_into"} & set(arrays):
-        check_indices(name, arrays[name], (vertices,), vertices)
-    index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
-    return BodyModel(
-        template=jnp.asarray(arrays["template"], jnp.float32),
-        shape_directions=jnp.asarray(directions, jnp.float32),
-        pose_directions=None,
-        joint_regressor=jnp.asarray(_dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)),
-        skinning_weights=jnp.asarray(_dense_rows(arrays, "weight", "weight_joints", vertices, joints)),
-        faces=jnp.asarray(arrays["faces"], jnp.int32),
-        uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
-        uv_faces=index("uv_faces"),
-        collapse_order=index("collapse_order"),
-        collapse_into=index("collapse_into"),
-        parents=tuple(parents),
-        joint_names=tuple(joint_names),
-        shape_names=tuple(str(name) for name in arrays["shape_names"]),
-        name=str(arrays["name"]),
-    )
+        arrays, _ = read_npz(path)
+        if str(arrays.get("format")) != FORMAT:
+            raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
+        if missing := sorted(KEYS - set(arrays)):
+            raise Refused(f"key '{missing[0]}' is missing")
+        parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]
+        check_joints(parents, joint_names)
+        joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
+        check_array("template", arrays["template"], (vertices, 3), -LARGEST, LARGEST)
+        check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST)
+        check_indices("faces", arrays["faces"], (None, 3), vertices)
+        directions = np.moveaxis(arrays["shape_directions"], 0, -1)
+        if directions.dtype == np.int16:
+            directions = directions * DIRECTION_STEP
+        uvs = arrays.get("uvs")
+        if uvs is not None:
+            check_array("uvs", uvs, (None, 2))
+            check_indices("uv_faces", arrays["uv_faces"], (len(arrays["faces"]), 3), len(uvs))
+            uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
+        for name in {"collapse_order", "collapse_into"} & set(arrays):
+            check_indices(name, arrays[name], (vertices,), vertices)
+        index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
+        return BodyModel(
+            template=jnp.asarray(arrays["template"], jnp.float32),
+            shape_directions=jnp.asarray(directions, jnp.float32),
+            pose_directions=None,
+            joint_regressor=jnp.asarray(_dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)),
+            skinning_weights=jnp.asarray(_dense_rows(arrays, "weight", "weight_joints", vertices, joints)),
+            faces=jnp.asarray(arrays["faces"], jnp.int32),
+            uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
+            uv_faces=index("uv_faces"),
+            collapse_order=index("collapse_order"),
+            collapse_into=index("collapse_into"),
+            parents=tuple(parents),
+            joint_names=tuple(joint_names),
+            shape_names=tuple(str(name) for name in arrays["shape_names"]),
+            name=str(arrays["name"]),
+        )
 
 
 # SMPL-X ---------------------------------------------------------------------------------------------------------------
@@ -215,33 +197,29 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
     Raises: FileNotFoundError; ValueError, naming file and key, for whatever does not fit the format.
     """
     with reading(path, "body model file"):
-        return _load_smplx(path, shape_count, expression_count)
-
-
-def _load_smplx(path: str | Path, shape_count: int, expression_count: int) -> BodyModel:
-    file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
-    template = file.numbers("v_template", (None, 3), LARGEST)
-    n = len(template)
-    weights = file.numbers("weights", (n, JOINTS), LARGEST)
-    check_row_sums("weights", weights)
-    directions, names = _shape_directions(file, n, shape_count, expression_count)
-    has_uvs = "vt" in file and "ft" in file
-    uvs = file.numbers("vt", (None, 2)) if has_uvs else None
-    number = lambda x: jnp.asarray(x, jnp.result_type(float))
-    return BodyModel(
-        template=number(template),
-        shape_directions=number(directions),
-        pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)), LARGEST)),
-        joint_regressor=number(file.numbers("J_regressor", (JOINTS, n), LARGEST)),
-        skinning_weights=number(weights),
-        faces=jnp.asarray(file.indices("f", n), jnp.int32),
-        uvs=None if uvs is None else number(uvs),
-        uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
-        parents=_parents(file),
-        joint_names=JOINT_NAMES,
-        shape_names=names,
-        name=Path(path).stem,
-    )
+        file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
+        template = file.numbers("v_template", (None, 3), LARGEST)
+        n = len(template)
+        weights = file.numbers("weights", (n, JOINTS), LARGEST)
+        check_row_sums("weights", weights)
+        directions, names = _shape_directions(file, n, shape_count, expression_count)
+        has_uvs = "vt" in file and "ft" in file
+        uvs = file.numbers("vt", (None, 2)) if has_uvs else None
+        number = lambda x: jnp.asarray(x, jnp.result_type(float))
+        return BodyModel(
+            template=number(template),
+            shape_directions=number(directions),
+            pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)), LARGEST)),
+            joint_regressor=number(file.numbers("J_regressor", (JOINTS, n), LARGEST)),
+            skinning_weights=number(weights),
+            faces=jnp.asarray(file.indices("f", n), jnp.int32),
+            uvs=None if uvs is None else number(uvs),
+            uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
+            parents=_parents(file),
+            joint_names=JOINT_NAMES,
+            shape_names=names,
+            name=Path(path).stem,
+        )
 
 
 def _shape_directions(
@@ -280,70 +258,3 @@ def load_hands(path: str | Path) -> HandBasis:
             means=number([file.numbers(f"hands_mean{side}", (45,)) for side in "lr"]),
             components=number([file.numbers(f"hands_components{side}", (45, 45)) for side in "lr"]),
         )
-
-
-def _part(name: str, values: Any, size: int, dtype: Any) -> Float[Array, " size"]:
-    """Rotations of one body part, flat; zeros if missing."""
-    if values is None:
-        return jnp.zeros(size, dtype)
-    values = jnp.asarray(values)
-    if values.size != size or values.shape not in {(size,), (size // 3, 3)}:
-        raise ValueError(f"{name}: expected shape ({size},) or ({size // 3}, 3), got {values.shape}")
-    return values.reshape(size)
-
-
-def _hand(side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_hand_mean: bool, dtype: Any) -> Float[Array, "45"]:
-    """Axis-angle numbers (45,) of one hand."""
-    name = ("left_hand_pose", "right_hand_pose")[side]
-    if hands is None and not (flat_hand_mean and (values is None or not use_pca)):
-        raise ValueError(f"{name}: use_pca or flat_hand_mean=False need the model's hand basis (`load_hands`)")
-    if values is not None and use_pca:
-        assert hands is not None  # else it was refused above
-        values = jnp.asarray(values)
-        if values.ndim != 1 or values.shape[0] > 45:
-            raise ValueError(f"{name}: expected at most 45 principal coefficients, got shape {values.shape}")
-        rotations = jnp.matmul(values, hands.components[side, : values.shape[0]], precision="highest")
-    else:
-        rotations = _part(name, values, 45, dtype)
-    if flat_hand_mean:
-        return rotations
-    assert hands is not None  # likewise
-    return rotations + hands.means[side]
-
-
-def assemble_pose(
-    *,
-    use_pca: bool,
-    flat_hand_mean: bool,
-    hands: HandBasis | None = None,
-    global_orient: Any = None,
-    body_pose: Any = None,
-    jaw_pose: Any = None,
-    leye_pose: Any = None,
-    reye_pose: Any = None,
-    left_hand_pose: Any = None,
-    right_hand_pose: Any = None,
-    transl: Any = None,
-) -> BodyPose:
-    """A full pose from named parts; missing ones are 0.
-
-    Arguments: global_orient, jaw_pose, leye_pose, reye_pose (3,); body_pose (63,) or (21, 3); hand poses (45,) or (15,
-    3) axis-angle, or with `use_pca` at most 45 coefficients; radians, and transl (3,) in metres.
-    `flat_hand_mean=False` adds the mean hand.
-    hands: from `load_hands`, needed for `use_pca` or `flat_hand_mean=False`.
-    Raises: ValueError, naming the part, for a wrong shape or a missing hand basis.
-    """
-    dtype = jnp.result_type(float)
-    part = lambda name, values, size: _part(name, values, size, dtype)
-    rotations = jnp.concatenate(
-        [
-            part("global_orient", global_orient, 3),
-            part("body_pose", body_pose, 63),
-            part("jaw_pose", jaw_pose, 3),
-            part("leye_pose", leye_pose, 3),
-            part("reye_pose", reye_pose, 3),
-            _hand(0, left_hand_pose, hands, use_pca, flat_hand_mean, dtype),
-            _hand(1, right_hand_pose, hands, use_pca, flat_hand_mean, dtype),
-        ]
-    )
-    return BodyPose(rotations.reshape(JOINTS, 3), part("transl", transl, 3))

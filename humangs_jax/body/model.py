@@ -40,21 +40,19 @@ BLOCK = 2048
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
     """Indices (j,) of every joint's parent, then grandparent, then the fourth, eighth ... ancestor; j where there is none.
 
-    Raises: ValueError if there is not exactly one root (-1), a parent does not exist, or the parents form a cycle.
+    Raises: ValueError unless all joints descend from one root (-1).
     """
-    count = len(parents)
-    if list(parents).count(-1) != 1:
-        raise ValueError(f"a body has one root joint with parent -1, got parents {parents}")
+    count, found = len(parents), []
+    wrong = ValueError(f"parents {parents}: expected joints that all descend from one root, whose parent is -1")
+    if list(parents).count(-1) != 1 or not set(parents) <= set(range(-1, count)):
+        raise wrong
     up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
-    if up.min() < 0 or up.max() > count:
-        raise ValueError(f"some joints do not descend from the root: parents {parents}")
-    iterations = []
     while (up[:-1] < count).any():
-        if len(iterations) > count.bit_length():
-            raise ValueError(f"some joints do not descend from the root: parents {parents}")
-        iterations.append(up[:-1])
+        if len(found) > count.bit_length():
+            raise wrong
+        found.append(up[:-1])
         up = up[up]
-    return iterations
+    return found
 
 
 def joint_transforms(
@@ -146,6 +144,11 @@ class SurfacePoints:
     directions: Float[Array, "p 3 s"]
     corrections: Float[Array, "p 3 q"] | None
     weights: Float[Array, "p j"]
+
+
+def surface_points(body: "BodyModel") -> SurfacePoints:
+    """All vertices."""
+    return SurfacePoints(body.template, body.shape_directions, body.pose_directions, body.skinning_weights)
 
 
 def shaped(mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]) -> Float[Array, "p 3"]:
@@ -272,8 +275,7 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     used, available = betas.shape[0], body.shape_directions.shape[-1]
     if used > available:
         raise ValueError(f"{used} shape coefficients, but body '{body.name}' has {available} shape directions")
-    directions = body.shape_directions[..., :used]
-    vertices = body.template + jnp.einsum("nas,s->na", directions, betas, precision=EXACT)
+    vertices = shaped(body.template, body.shape_directions, betas)
     return RestBody(vertices, jnp.matmul(body.joint_regressor, vertices, precision=EXACT))
 
 

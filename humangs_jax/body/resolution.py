@@ -25,7 +25,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
-from humangs_jax.geometry.mesh import face_crosses, vertex_areas
+from humangs_jax.geometry.mesh import directions_around, edges, face_crosses, in_front, vertex_areas
 
 # Finer ----------------------------------------------------------------------------------------------------------------
 
@@ -52,16 +52,16 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     faces = np.asarray(body.faces)
     linear["area"] = vertex_areas(linear["template"], faces)
     while True:
-        edges, edge_of_side = _edges(faces)
-        lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
+        ends, edge_of_side = edges(faces)
+        lengths = np.linalg.norm(linear["template"][ends[:, 0]] - linear["template"][ends[:, 1]], axis=-1)
         if lengths.max() > FINEST * longest:
             raise ValueError(f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m")
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
             break
-        midpoint = np.full(len(edges), -1)
+        midpoint = np.full(len(ends), -1)
         midpoint[long] = len(linear["template"]) + np.arange(len(long))
-        middle = {name: 0.5 * (x[edges[long, 0]] + x[edges[long, 1]]) for name, x in linear.items()}
+        middle = {name: 0.5 * (x[ends[long, 0]] + x[ends[long, 1]]) for name, x in linear.items()}
         linear = {name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()}
         faces = _cut(faces, midpoint[edge_of_side])
     spacing = np.sqrt(vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA))
@@ -79,13 +79,6 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         collapse_into=None,
         made_for=None,
     )
-
-
-def _edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Undirected edges (e, 2), and which of them each side (corner i to i + 1) of each face is (f, 3)."""
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
-    edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
-    return edges, index.reshape(faces.shape)
 
 
 def _cut(faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "finer 3"]:
@@ -149,22 +142,7 @@ def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(np.ptp(vertices, axis=0))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
-    columns = int(size / cell) + 3
-    golden_angle = np.pi * (3 - np.sqrt(5))
-    seen = np.zeros(len(vertices))
-    for i in range(VIEWS):
-        y = 1 - 2 * (i + 0.5) / VIEWS
-        radius = np.sqrt(1 - y * y)
-        forward = np.array([radius * np.cos(golden_angle * i), y, radius * np.sin(golden_angle * i)])
-        right = np.linalg.svd(forward[None])[2][1]
-        frame = np.stack([right, np.cross(forward, right), forward])
-        (right_of, above, depth), own = frame @ points.T, frame @ vertices.T
-        left, low = right_of.min(), above.min()
-        cells = lambda x, y, left=left, low=low: columns * ((x - left) / cell).astype(int) + ((y - low) / cell).astype(int)
-        buffer = np.full(columns * columns, np.inf)
-        np.minimum.at(buffer, cells(right_of, above), depth)
-        seen += own[2] < buffer[cells(own[0], own[1])] + 2 * cell
-    return seen / VIEWS
+    return np.mean([in_front(vertices, points, forward, cell, 2 * cell) for forward in directions_around(VIEWS)], axis=0)
 
 
 class _Mesh:
@@ -267,8 +245,8 @@ def _squared(x: Sequence[float]) -> float:
 
 
 def _quality(normal: Sequence[float], a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
-    edges = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
-    return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(edges, 1e-30)
+    lengths = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
+    return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(lengths, 1e-30)
 
 
 def _vertex_quadrics(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 11"]:

@@ -30,12 +30,15 @@ class Detections:
         return keypoints_of(views, self.keypoints, self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
-        """The keypoints of the views, and without a file of them the record of the fit in the capture's folder."""
+        """The keypoints of the views; without a file of them those of the fit in the capture's folder, and its record."""
         from humangs_jax.data.photos import capture_folder
         from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         file = capture_folder(capture) / FIT_FILE
-        return self.read(views), read_fit_record(file) if self.keypoints is None and file.exists() else None
+        if self.keypoints is not None or not file.exists():
+            return self.read(views), None
+        record = read_fit_record(file)
+        return record.of_views(views.names), record
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +146,6 @@ class Fit:
             from humangs_jax.detection.people import available
             from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
-            from humangs_jax.fitting.landmark_fit import FitConfig
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
         tell_deleted(target, unless=target if self.out is None else self.capture)
@@ -158,10 +160,9 @@ class Fit:
             keypoints = detections.read(photos)
             body = load_body(self.body)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
-        config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
         with stage("fitting"):
             fixed = self.refinement.fixed_cameras
-            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config, fixed_cameras=fixed)
+            fitted = fit_photos(photos, keypoints, body, body_file=body_file, smoothness=self.smoothness, fixed_cameras=fixed)
         with stage("examining the fit"):
             report = fitted.report
         report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
@@ -183,7 +184,6 @@ class Fit:
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
-            keypoints = keypoints if record is None else record.of_views(start.names)
         fixed, bare = self.refinement.fixed_cameras, self.scan.bare
         config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
@@ -268,20 +268,19 @@ class Check:
         with stage("reading the capture"):
             capture = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read_or_recorded(self.capture, capture)
-        if available() and (capture.masks is None or (keypoints is None and record is None)):
-            capture, keypoints = self._found(capture, keypoints, record)
+        if available() and (capture.masks is None or keypoints is None):
+            capture, keypoints = self._found(capture, keypoints)
         with stage("drawing the body"):
-            same = record is not None and record.names == capture.names
-            report = check_capture(capture, self.out, record.keypoints if same else keypoints)
+            report = check_capture(capture, self.out, keypoints)
         tell(report)
         wrote(self.out, "the body over the photos")
         ok = report.ok
-        if record is not None or keypoints is not None:
+        if keypoints is not None:
             with stage("examining the fit"):
                 from humangs_jax.apps.check import fit_sheet
-                from humangs_jax.fitting.fit_capture import examine_record
+                from humangs_jax.fitting.fit_capture import examine
 
-                examination, keypoints = examine_record(capture, record, keypoints)
+                examination = examine(capture, keypoints, record)
                 fit_sheet(capture, keypoints, examination, sheet)
             tell(f"\n{examination.report}")
             wrote(sheet, "the keypoints over the photos")
@@ -289,18 +288,17 @@ class Check:
         if ok:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
 
-    def _found(self, capture: Any, keypoints: Any, record: Any) -> tuple[Any, Any]:
+    def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
         """The capture and its keypoints, with what is found in the photos where either is missing; in memory only."""
         import numpy as np
 
         from humangs_jax.apps import detect
         from humangs_jax.data.photos import capture_folder
 
-        known = keypoints if record is None else record.of_views(capture.names)
         folder = capture_folder(self.capture)
         try:
             with stage("finding the person"):
-                people, person = detect.person_in_capture(folder, capture, known, self.detections.person)
+                people, person = detect.person_in_capture(folder, capture, keypoints, self.detections.person)
         except ValueError as error:
             warn(f"{error}; the check does without what it would have found")
             return capture, keypoints
@@ -308,4 +306,4 @@ class Check:
         if capture.masks is None:
             masks = np.stack([detect.person_mask(photo, person) for photo in people])
             capture = dataclasses.replace(capture, masks=masks)
-        return capture, detect.keypoints_of(people, person) if known is None else keypoints
+        return capture, detect.keypoints_of(people, person) if keypoints is None else keypoints

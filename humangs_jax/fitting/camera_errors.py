@@ -11,13 +11,13 @@ what a shift of a person who moves evenly does, but not limbs that swing. Turns 
 """
 
 import dataclasses
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -84,44 +84,45 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     """The cameras that keypoints show to be late, and those that they show to be turned, those that explain most first; none with
     fewer than three of them.
     """
-    late, keypoints = _late_cameras(photos, keypoints)
-    return (*late, *_turned_cameras(photos, keypoints))
-
-
-def _turned_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    seen = _Seen.of(photos, keypoints)
-    if seen is None:
+    camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
+    if not 3 <= camera_of.max() + 1 <= CAMERAS:
         return ()
+    late, keypoints = _late_cameras(photos, keypoints, camera_of)
+    return (*late, *_turned_cameras(photos, keypoints, camera_of))
+
+
+def _turned_cameras(photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]) -> list[CameraError]:
+    seen = _Seen.of(photos, keypoints, camera_of)
+    if seen is None:
+        return []
     gradients, matrices = seen.equations()
+    solved = lambda cameras: _solved(gradients, matrices, cameras)
     chosen: list[int] = []
     gain = 0.0
     while len(chosen) < seen.count - 2:
-        others = [c for c in range(seen.count) if c not in chosen]
-        found = {c: _solved(gradients, matrices, [*chosen, c]) for c in others}
-        best = max(others, key=lambda c: found[c].gain)
+        found = {c: solved([*chosen, c]) for c in range(seen.count) if c not in chosen}
+        best = max(found, key=lambda c: found[c].gain)
         if found[best].clear < CLEAR or found[best].gain < gain + LEAST_GAIN:
             break
         chosen, gain = [*chosen, best], found[best].gain
     if not chosen:
-        return ()
-    solved = _solved(gradients, matrices, chosen)
-    sizes = np.degrees(np.linalg.norm(solved.rotations, axis=-1))
+        return []
+    rotations = solved(chosen).rotations
+    sizes = np.degrees(np.linalg.norm(rotations, axis=-1))
     if sizes.max() > MOST_DEGREES:
-        return ()
-    name = lambda camera: photos.names[int(np.flatnonzero(seen.camera_of == camera)[0])]
+        return []
     errors = []
-    for camera, rotation, size in zip(chosen, solved.rotations, sizes, strict=True):
+    for camera, rotation, size in zip(chosen, rotations, sizes, strict=True):
+        if size <= LEAST_DEGREES:
+            continue
         without = [c for c in chosen if c != camera]
-        rest = _solved(gradients, matrices, without).gain if without else 0.0
-        others = [c for c in range(seen.count) if c not in chosen]
-        alike = lambda c, rest=rest, without=without: (
-            _solved(gradients, matrices, [*without, c]).gain - rest > ALIKE * (solved.gain - rest)
-        )
-        names = (name(camera), *(name(c) for c in others if alike(c)))
-        if size > LEAST_DEGREES:
-            views = tuple(np.flatnonzero(seen.camera_of == camera).tolist())
-            errors.append(CameraError(views, names, tuple(rotation.tolist())))
-    return tuple(errors)
+        rest = solved(without).gain if without else 0.0
+        others = (c for c in range(seen.count) if c not in chosen)
+        alike = [c for c in others if solved([*without, c]).gain - rest > ALIKE * (gain - rest)]
+        views = [np.flatnonzero(camera_of == c).tolist() for c in (camera, *alike)]
+        names = tuple(photos.names[own[0]] for own in views)
+        errors.append(CameraError(tuple(views[0]), names, tuple(rotation.tolist())))
+    return errors
 
 
 def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
@@ -137,16 +138,17 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
 # Time ----------------------------------------------------------------------------------------------------------------
 
 
-def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple[CameraError, ...], Keypoints]:
+def _late_cameras(
+    photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"]
+) -> tuple[list[CameraError], Keypoints]:
     """The cameras that are late, and the keypoints as if they were not; what then has no photo has no certainty."""
-    camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     count, frames, found = int(camera_of.max()) + 1, photos.frame_count, {}
-    if not 3 <= count <= TIMED or frames < TIMED:
-        return (), keypoints
+    if count > TIMED or frames < TIMED:
+        return [], keypoints
     view_at = np.full((count, frames + 2 * MOST_LATE), -1)
     view_at[camera_of, np.asarray(photos.frames) + MOST_LATE] = np.arange(len(camera_of))
     if (view_at >= 0).sum(1).min() < TIMED:
-        return (), keypoints
+        return [], keypoints
 
     def shifted(late):
         """The keypoints of cameras that are late by so many frames, {camera: frames}, when the others saw the same."""
@@ -157,10 +159,10 @@ def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple
         return dataclasses.replace(keypoints, points=keypoints.points[views], confidences=confidences, world=None)
 
     def look(late):
-        return _Seen.of(photos, shifted(late), edge=MOST_LATE)
+        return _Seen.of(photos, shifted(late), camera_of, edge=MOST_LATE)
 
     if (seen := look({})) is None:
-        return (), keypoints
+        return [], keypoints
     state = seen.bundle()
     while len(found) < (count - 1) // 2:
         costs, guesses = seen.costs(state), []
@@ -181,8 +183,8 @@ def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple
         found[best[0]] = best[1]
         seen, state = tried[best], states[best]
     views = {c: np.flatnonzero(camera_of == c).tolist() for c in found}
-    errors = (CameraError(tuple(own), (photos.names[own[0]],), late=found[c]) for c, own in views.items())
-    return tuple(errors), shifted(found)
+    errors = [CameraError(tuple(own), (photos.names[own[0]],), late=found[c]) for c, own in views.items()]
+    return errors, shifted(found)
 
 
 # Equations -----------------------------------------------------------------------------------------------------------
@@ -190,33 +192,30 @@ def _late_cameras(photos: Photos | Capture, keypoints: Keypoints) -> tuple[tuple
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Seen:
-    """Keypoints of m moments in c views, k landmarks; camera: (m, c) numbers below `count`; camera_of: (v,)."""
+    """Keypoints of m moments in c views, k landmarks; camera: (m, c) numbers below `count`."""
 
     points: Float[np.ndarray, "m c k 2"]
     weights: Float[np.ndarray, "m c k"]
     K: Float[np.ndarray, "m c 3 3"]
     matrices: Float[np.ndarray, "m c 4 4"]
-    camera: np.ndarray
-    camera_of: np.ndarray
+    camera: Int[np.ndarray, "m c"]
     count: int
 
     @classmethod
-    def of(cls, photos: Photos | Capture, keypoints: Keypoints, edge: int = 0) -> "_Seen | None":
+    def of(
+        cls, photos: Photos | Capture, keypoints: Keypoints, camera_of: Int[np.ndarray, " v"], edge: int = 0
+    ) -> "_Seen | None":
         """None if there is too little to say anything. edge: moments at either end that are left out."""
         kinds = [name.removeprefix("left_").removeprefix("right_") in PARTS for name in keypoints.set.names]
         observations, views = group_by_frame(photos, keypoints)
-        camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
-        count = int(camera_of.max()) + 1
-        if count < 3 or count > CAMERAS:
-            return None
         some = np.unique(np.linspace(edge, len(views) - 1 - edge, FRAMES).round().astype(int))
         as_double = lambda name: np.asarray(getattr(observations, name), np.float64)[some]
         weights = as_double("confidences")[..., kinds]
         weights = weights * ((weights > 0).sum(1, keepdims=True) >= 2)
         if ((weights > 0).any((0, 1))).sum() < 8:
             return None
-        points = as_double("points")[:, :, kinds]
-        return cls(points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], camera_of, count)
+        points, count = as_double("points")[:, :, kinds], int(camera_of.max()) + 1
+        return cls(points, weights, as_double("K"), as_double("cam_from_world"), camera_of[views[some]], count)
 
     def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
         """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and Hessians (k, 3 n, 3 n), in
@@ -242,7 +241,7 @@ class _Seen:
     def costs(self, state: Bundle, units: Bundle | None = None) -> Float[np.ndarray, " k"]:
         """(k,) means of the robust costs of the landmarks of a bundle, in units of its noise, or of another one's."""
         noise = (units or state)[3]
-        lengths = np.linalg.norm(self._errors(*state[:2]), axis=-1) / noise
+        lengths = np.linalg.norm(self._project(*state[:2])[-1], axis=-1) / noise
         total = self.weights.sum((0, 1))
         costs = (self.weights * lengths**2 / (1 + (lengths / ROBUST_SCALE) ** 2)).sum((0, 1))
         return costs / np.where(total > 0, total, np.inf)
@@ -257,7 +256,7 @@ class _Seen:
 
     def misses(self, camera: int, state: Bundle) -> float:
         """Median distance of a camera's landmarks from the points of a bundle, pixels."""
-        lengths = np.linalg.norm(self._errors(*state[:2]), axis=-1)
+        lengths = np.linalg.norm(self._project(*state[:2])[-1], axis=-1)
         return float(np.median(lengths[(self.weights > 0) & (self.camera == camera)[..., None]]))
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
@@ -269,29 +268,25 @@ class _Seen:
         return np.broadcast_to(np.linalg.solve(total + 1e-6 * np.eye(3), right), (len(axes), self.points.shape[2], 3))
 
     def _project(self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]) -> tuple[np.ndarray, ...]:
+        """Rotations (m, c, 3, 3), points in the cameras (m, c, k, 3), depths, slopes, focal lengths, and errors (m, c, k, 2)."""
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
         shift = np.einsum("mcab,mcb->mca", turn, self.matrices[..., :3, 3])
         local = np.einsum("mcab,mkb->mcka", rotation, points) + shift[:, :, None]
         depth = np.maximum(local[..., 2], 0.05)
-        focal = np.stack([self.K[..., 0, 0], self.K[..., 1, 1]], axis=-1)[:, :, None]
-        return rotation, local, depth, local[..., :2] / depth[..., None], focal
-
-    def _errors(self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]) -> Float[np.ndarray, "m c k 2"]:
-        _, _, _, slope, focal = self._project(turned, points)
-        return slope * focal + self.K[:, :, None, :2, 2] - self.points
+        focal, slope = self.K[:, :, None, [0, 1], [0, 1]], local[..., :2] / depth[..., None]
+        return rotation, local, depth, slope, focal, slope * focal + self.K[:, :, None, :2, 2] - self.points
 
     def _linear(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"], weights: Float[np.ndarray, "m c k"]
     ) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"], Float[np.ndarray, "m c k 2"], Float[np.ndarray, "m k 3"]]:
         """Gradients and Hessians at rotations, the residuals, and the points after one more step of Gauss and Newton."""
-        rotation, local, depth, slope, focal = self._project(turned, points)
-        errors = slope * focal + self.K[:, :, None, :2, 2] - self.points
+        rotation, local, depth, slope, focal, errors = self._project(turned, points)
         by_local = np.zeros((*depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = focal / depth[..., None]
         by_local[..., 2] = -focal * slope / depth[..., None]
         by_point = np.einsum("mckia,mcab->mckib", by_local, rotation)
-        by_turn = -np.einsum("mckia,mckab->mckib", by_local, _cross(local))
+        by_turn = np.einsum("mckia,mckab->mckib", by_local, np.cross(local[..., None, :], np.eye(3)))
         own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
         inverse = np.linalg.inv(own + (1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]) * np.eye(3))
         step = np.einsum("mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True)
@@ -308,19 +303,11 @@ class _Seen:
         return gradients.transpose(1, 0, 2).reshape(k, 3 * n), flat, errors, points - step
 
 
-def _cross(vectors: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    none = np.zeros_like(x)
-    rows = ((none, -z, y), (z, none, -x), (-y, x, none))
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def _solve(gradient: Float[np.ndarray, " u"], matrix: Float[np.ndarray, "u u"]) -> Float[np.ndarray, " u"]:
     return np.linalg.solve(matrix + np.eye(len(matrix)) / PRIOR**2, gradient)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Solved:
+class _Solved(NamedTuple):
     """rotations: (s, 3). gain: by how much the cost falls. clear: standard errors of the last camera's rotation."""
 
     rotations: Float[np.ndarray, "s 3"]

@@ -30,14 +30,13 @@ from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, Keypoints
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
-from humangs_jax.io.arrays import read_npz, write_npz
+from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
 FOUND = ("noise", "joint_std", "determined", "shape_covariance")
-KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
 
 
 # fit.npz -------------------------------------------------------------------------------------------------------------
@@ -82,28 +81,18 @@ def read_fit_record(path: str | Path) -> FitRecord:
     """Read fit.npz. Raises: CaptureError naming file and key."""
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
-        values, pickled = read_npz(path)
-        if pickled:
-            raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
-        for key in KEYS:
-            if key not in values:
-                raise CaptureError(path, key, "missing: expected a file that `humangs fit` wrote")
-        name = str(values["set"])
+        file = ArrayFile.open(path, CaptureError)
+        own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
+        name, names = str(file.array("set")), tuple(map(str, file.array("names")))
         if name not in KEYPOINT_SETS:
             raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
-        names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
+        kind = KEYPOINT_SETS[name]
         v, k = len(names), len(kind.names)
-        offsets = numbers(values["places"], path, "places", (k, 3))
-        kind = kind.adapted(offsets, numbers(values["certainty"], path, "certainty", (k,)))
-        points = numbers(values["points"], path, "points", (v, k, 2))
-        confidences = numbers(values["confidences"], path, "confidences", (v, k))
-        noise = numbers(values["noise"], path, "noise")
-        joint_std = numbers(values["joint_std"], path, "joint_std")
-        determined = numbers(values["determined"], path, "determined", joint_std.shape)
-        if noise.shape != joint_std.shape[:1]:
-            raise CaptureError(path, "noise", f"expected {joint_std.shape[:1]} frames, got {noise.shape}")
-        covariance = numbers(values["shape_covariance"], path, "shape_covariance")
-        return FitRecord(Keypoints(points, confidences, kind), names, noise, joint_std, determined, covariance)
+        kind = kind.adapted(own("places", (k, 3)), own("certainty", (k,)))
+        keypoints = Keypoints(own("points", (v, k, 2)), own("confidences", (v, k)), kind)
+        noise = own("noise", (None,))
+        joint_std = own("joint_std", (len(noise), None))
+        return FitRecord(keypoints, names, noise, joint_std, own("determined", joint_std.shape), own("shape_covariance"))
 
 
 # Captures ------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, without_expression
 from humangs_jax.core.array_types import Array, Bool, Float
-from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
@@ -22,7 +23,6 @@ from humangs_jax.fitting.landmark_fit import (
     MOTION_SCALE,
     ROBUST_SCALES,
     STAGES,
-    FitConfig,
     LandmarkFit,
     accelerations,
     fit_landmarks,
@@ -46,15 +46,14 @@ from humangs_jax.fitting.residuals.keypoints import (
     group_by_frame,
     keypoint_errors,
 )
-from humangs_jax.fitting.swaps import Swap, find_exchanged_hands, find_mirrored, find_swaps
+from humangs_jax.fitting.swaps import Swap, find_mirrored, find_swaps
 
 UNSEEN = 1e-8
 """Least information about position and orientation; keeps the inverse finite for frames without keypoints."""
 
 
-@pytree_dataclass
-class Uncertainty:
-    """The uncertainty of a fit of m frames (numpy on the host).
+class Uncertainty(NamedTuple):
+    """The uncertainty of a fit of m frames.
 
     joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j) share of the prior's variance of
     a joint's rotation, mean over axes, that the views remove: 1 all, 0 nothing, as for joints that no keypoint depends on.
@@ -72,34 +71,22 @@ class Uncertainty:
 
 
 def fit_uncertainty(model: LandmarkModel, observations: Observations, fit: LandmarkFit) -> Uncertainty:
-    """The covariance of a fit to these observations, in float64.
-
-    Raises: ValueError if the fit has a different number of frames than the observations.
-    """
-    m = len(observations.noise)
-    if len(fit.noise) != m:
-        raise ValueError(f"a fit of {len(fit.noise)} frames, but observations of {m}")
+    """The covariance of a fit to these observations, in float64."""
     model = replace(model, certainty=fit.certainty)
-    by_pose, by_shape, joints_by_pose, joints_by_shape = (
-        np.asarray(x, np.float64) for x in _derivatives(model, replace(observations, noise=fit.noise), fit)
-    )
-    information = np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
+    derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
+    residuals_by, joints_by = (np.asarray(x, np.float64) for x in derivatives)
+    shapes = len(fit.betas)
+    by_pose, by_shape = np.split(residuals_by, [residuals_by.shape[-1] - shapes], axis=-1)
+    own = np.linalg.inv(np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1]))
     coupling = np.einsum("mra,mrs->mas", by_pose, by_shape)
-    own = np.linalg.inv(information)
     carried = own @ coupling
-    shapes = by_shape.shape[-1]
     shape_information = np.einsum("mrs,mrt->st", by_shape, by_shape) - np.einsum("mas,mat->st", coupling, carried)
-    shape_covariance = np.linalg.inv(shape_information + np.eye(shapes))
-    poses = own + carried @ shape_covariance @ carried.swapaxes(-1, -2)
-    cross = -carried @ shape_covariance
-    mixed = np.einsum("mjap,mps,mjbs->mjab", joints_by_pose, cross, joints_by_shape)
-    covariances = (
-        np.einsum("mjap,mpq,mjbq->mjab", joints_by_pose, poses, joints_by_pose)
-        + mixed
-        + mixed.swapaxes(-1, -2)
-        + np.einsum("mjas,st,mjbt->mjab", joints_by_shape, shape_covariance, joints_by_shape)
-    )
-    return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape_covariance)
+    shape = np.linalg.inv(shape_information + np.eye(shapes))
+    poses = own + carried @ shape @ carried.swapaxes(-1, -2)
+    mixed = -carried @ shape
+    whole = np.block([[poses, mixed], [mixed.swapaxes(-1, -2), np.broadcast_to(shape, (len(own), shapes, shapes))]])
+    covariances = np.einsum("mjap,mpq,mjbq->mjab", joints_by, whole, joints_by, optimize=True)
+    return Uncertainty(covariances, _determined(keypoint_problem(model), poses), shape)
 
 
 def _determined(problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]) -> Float[np.ndarray, "m j"]:
@@ -116,25 +103,21 @@ def _determined(problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]) -> 
 @jax.jit
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
-) -> tuple[Float[Array, "m r p"], Float[Array, "m r s"], Float[Array, "m j 3 p"], Float[Array, "m j 3 s"]]:
-    problem = keypoint_problem(model)
+) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
+    """Of residuals and joints of each frame by its unknowns: global_orient, transl, body_pose, then the shape."""
+    problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
+    poses = jnp.concatenate([state.global_orient, state.transl, state.body_pose.reshape(m, -1)], axis=1)
+    p = poses.shape[1]
 
-    def both(seen, vector, betas):
-        pose = {"global_orient": vector[:3], "transl": vector[3:6], "body_pose": vector[6:].reshape(-1, 3)}
-        state = replace(fit.state, betas=betas, **pose)
-        found = frame_residuals(problem, seen, state, ROBUST_SCALES[-1])
+    def both(vector, seen):
+        pose = {"global_orient": vector[:3], "transl": vector[3:6], "body_pose": vector[6:p].reshape(-1, 3)}
+        moved = replace(state, betas=vector[p:], **pose)
+        found = frame_residuals(problem, seen, moved, ROBUST_SCALES[-1])
         found.pop("shape")
-        positions = problem.landmarks_and_joints(state)[1]
-        return jnp.concatenate([leaf.ravel() for leaf in found.values()]), positions
+        return jnp.concatenate([leaf.ravel() for leaf in found.values()]), problem.landmarks_and_joints(moved)[1]
 
-    def frame(seen, own):
-        vector = jnp.concatenate([own.global_orient, own.transl, own.body_pose.ravel()])
-        (by_pose, by_shape), (joints_by_pose, joints_by_shape) = jax.jacfwd(both, argnums=(1, 2))(seen, vector, own.betas)
-        return by_pose, by_shape, joints_by_pose, joints_by_shape
-
-    m = len(observations.noise)
-    own = replace(fit.state, betas=jnp.broadcast_to(fit.state.betas, (m, *fit.state.betas.shape)), places=None)
-    return jax.lax.map(lambda x: frame(*x), (observations, own))
+    vectors = jnp.concatenate([poses, jnp.tile(state.betas, (m, 1))], axis=1)
+    return jax.lax.map(lambda each: jax.jacfwd(both)(*each), (vectors, observations))
 
 
 OUTLIER = 5.0
@@ -162,22 +145,22 @@ class Examination:
 
 
 def examine(
-    capture: Capture,
-    keypoints: Keypoints,
-    *,
-    joint_std: Float[np.ndarray, "m j"] | None = None,
-    determined: Float[np.ndarray, "m j"] | None = None,
-    noise: Float[np.ndarray, " m"] | None = None,
-    mirrored: tuple[Swap, ...] = (),
+    capture: Capture, keypoints: Keypoints, record: FitRecord | None = None, mirrored: tuple[Swap, ...] = ()
 ) -> Examination:
     """Compare the body of a capture with keypoints of its views, in the order of the views.
 
-    Arguments: joint_std, determined: of joints, metres and shares, see `fit_uncertainty`. noise: pixels, as the fit found it;
-    default: from the median error. mirrored: result of `find_mirrored`.
-    Raises: ValueError if the number of views differs, or the body has none of the landmarks.
+    Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the median error), and what
+    the views determine. mirrored: result of `find_mirrored`.
+    Raises: ValueError if the number of views differs, the record is of fewer frames, or the body has none of the landmarks.
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
+    names = capture.body.joint_names
+    if record is not None and (len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)):
+        raise ValueError(
+            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
+            f"{capture.frames.max() + 1} and {len(names)}: fit it again"
+        )
     observations, views = group_by_frame(capture, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     kind = keypoints.set
@@ -186,26 +169,25 @@ def examine(
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
-    noise = (
-        noise[: len(views)] if noise is not None else np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
-    )
+    noise, undetermined = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)), ()
+    if record is not None:
+        noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
+        undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
     outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
 
     frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
     by_view = lambda values: values[frame_of, slot_of]
     numbers = zip(capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True)
     rows = tuple(_view_report(*own) for own in numbers)
-    violations = limit_violations(capture.body.joint_names, poses)
-    known = [None if values is None else values[: len(views)] for values in (joint_std, determined)]
-    swaps = (*mirrored, *find_swaps(observations, keypoints.set, views, capture.names))
-    swaps += find_exchanged_hands(keypoints, capture.names)
+    violations = limit_violations(names, poses)
+    swaps = (*mirrored, *find_swaps(observations, kind, views, capture.names))
     report = FitReport(
         fitted="keypoints",
         errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
         views=rows,
         violations=violations,
         swaps=swaps,
-        undetermined=undetermined_joints(capture.body.joint_names, compared.any((1, 2)), *known),
+        undetermined=undetermined,
         notes=_worst_frame(frames),
         warnings=(
             *(f"{error}, as the keypoints show: {REMEDIES[error.late != 0]}" for error in find_camera_errors(capture, keypoints)),
@@ -214,27 +196,6 @@ def examine(
     )
     landmarks = by_view(errors + np.asarray(observations.points))
     return Examination(report, frames, noise, landmarks, by_view(compared), by_view(outliers))
-
-
-def examine_record(
-    capture: Capture, record: FitRecord | None, keypoints: Keypoints | None = None
-) -> tuple[Examination, Keypoints]:
-    """Examine a capture with the record of its fit, or with other keypoints; also returns the keypoints, ordered by view.
-
-    Raises: ValueError if both are None, if the record is of other views or of fewer frames, or as `examine` does.
-    """
-    if keypoints is not None:
-        return examine(capture, keypoints), keypoints
-    if record is None:
-        raise ValueError("neither keypoints nor the record of a fit to examine the body with")
-    keypoints = record.of_views(capture.names)
-    if len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(capture.body.joint_names):
-        raise ValueError(
-            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
-            f"{capture.frames.max() + 1} and {len(capture.body.joint_names)}: fit it again"
-        )
-    known = {name: getattr(record, name) for name in ("joint_std", "determined", "noise")}
-    return examine(capture, keypoints, **known), keypoints
 
 
 @jax.jit
@@ -284,16 +245,15 @@ class FittedCapture:
     fit: LandmarkFit
     model: LandmarkModel
     observations: Observations
-    config: FitConfig
+    smoothness: float
     camera_errors: tuple[CameraError, ...] = ()
 
     @functools.cached_property
     def report(self) -> FitReport:
         """How good it is. Made when asked for: it fits the mirrored keypoints and tries exchanges of views."""
-        record, fit, kind = self.record, self.fit, self.record.keypoints.set
-        known = {name: getattr(record, name) for name in ("joint_std", "determined", "noise")}
-        mirrored = find_mirrored(self.model, self.observations, kind, fit, self.config)
-        report = examine(self.capture, record.keypoints, mirrored=mirrored, **known).report
+        keypoints, fit = self.record.keypoints, self.fit
+        mirrored = find_mirrored(self.model, self.observations, keypoints.set, fit)
+        report = examine(self.capture, keypoints, self.record, mirrored).report
         seen = np.asarray(self.observations.confidences) * np.asarray(self.model.known) > 0
         smooth = "motion" in fit.outcomes
         names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
@@ -301,7 +261,7 @@ class FittedCapture:
         warnings = (
             *report.warnings,
             *_blind_frames(seen, smooth),
-            *_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), self.config.smoothness),
+            *_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), self.smoothness),
         )
         turned = (f"{error}: turned back" for error in self.camera_errors)
         notes = (*report.notes, *_places(self.model, fit), *turned)
@@ -314,17 +274,16 @@ def fit_photos(
     body: BodyModel,
     *,
     body_file: str = DEFAULT_BODY,
-    config: FitConfig | None = None,
+    smoothness: float = 0.0,
     fixed_cameras: bool = False,
 ) -> FittedCapture:
     """Find shape and poses of the person in photos, and turn cameras back that the keypoints show to be turned.
 
     Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes from, see `Capture`.
-    fixed_cameras: they stay as they are.
+    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are.
     Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or the body's root is not its
     first joint.
     """
-    config = config or FitConfig()
     if len(keypoints.points) != len(photos.names):
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos")
     if body.parents.index(-1) != 0:
@@ -336,7 +295,7 @@ def fit_photos(
     observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
-    fit = fit_landmarks(model, observations, config)
+    fit = fit_landmarks(model, observations, smoothness)
     found = fit_uncertainty(model, observations, fit)
     capture = Capture(**vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
     moved = np.zeros((len(kind.names), 3))
@@ -345,7 +304,7 @@ def fit_photos(
     keypoints = dataclasses.replace(keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty)))
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
-    return FittedCapture(capture, record, fit, model, observations, config, errors)
+    return FittedCapture(capture, record, fit, model, observations, smoothness, errors)
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:

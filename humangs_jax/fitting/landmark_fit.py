@@ -11,15 +11,14 @@
 The first four are one program that runs with other weights and other free unknowns, because compilation dominates the time.
 """
 
-import dataclasses
 import functools
-import itertools
 import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
@@ -69,20 +68,10 @@ ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
 """Of keypoint errors in these stages and in that of the person, standard deviations."""
 STARTS = (4, 2)
 """Orientations that are followed, for one view and for several."""
-STEPS = 150
-"""Of the solver in a stage of one frame, at most."""
+STEPS = PERSON_STEPS = 150
+"""Of the solver in a stage of one frame, and for all frames together, at most."""
 TOLERANCE = 3e-4
 """Of the unknowns, which are of unit size."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FitConfig:
-    """Static settings of a fit."""
-
-    smoothness: float = 0.0
-    """Expected acceleration of joints, metres per frame squared; 0: frames are independent."""
-    person_steps: int = 150
-    """Of the solver for all frames together, at most."""
 
 
 @pytree_dataclass
@@ -107,18 +96,19 @@ class LandmarkFit:
 
 
 @checked_arguments
-def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitConfig = FitConfig()) -> LandmarkFit:
+def fit_landmarks(model: LandmarkModel, observations: Observations, smoothness: float = 0.0) -> LandmarkFit:
     """Shape and poses of one person.
 
-    Arguments: observations: a batch of m frames, in their order in time where motion is to be smooth. The result is finite for
-    all finite observations; frames without keypoints rest in the prior's usual pose, or with smooth motion are interpolated.
+    Arguments: observations: a batch of m frames, in their order in time where motion is to be smooth. smoothness: expected
+    acceleration of joints, metres per frame squared; 0: frames are independent. The result is finite for all finite observations;
+    frames without keypoints rest in the prior's usual pose, or with smooth motion are interpolated.
     """
-    fit = _fit_frames(model, observations, dataclasses.replace(config, smoothness=0.0))
-    return smooth_motion(model, observations, fit, config) if config.smoothness and len(fit.noise) > 2 else fit
+    fit = _fit_frames(model, observations)
+    return smooth_motion(model, observations, fit, smoothness) if smoothness and len(fit.noise) > 2 else fit
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def _fit_frames(model: LandmarkModel, observations: Observations, config: FitConfig) -> LandmarkFit:
+@jax.jit
+def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
     """All stages but the motion."""
     problem = keypoint_problem(model)
     states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
@@ -130,7 +120,7 @@ def _fit_frames(model: LandmarkModel, observations: Observations, config: FitCon
     places = jnp.zeros((groups, 3)) if many else None
     start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
     residuals = lambda state: _person_residuals(problem, observations, state)
-    state, outcomes["person"] = solve(residuals, start, config.person_steps, method="lbfgs", tolerance=TOLERANCE)
+    state, outcomes["person"] = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
     return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
 
 
@@ -210,13 +200,8 @@ def _rigid_starts(
 
 
 def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
-    """(24, 3, 3) the rotations that map the axes to each other."""
-    signed = (
-        np.eye(3)[list(order)] * np.asarray(signs)[:, None]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1, -1), repeat=3)
-    )
-    return np.stack([m for m in signed if np.linalg.det(m) > 0])
+    """The rotations that map the axes to each other."""
+    return np.rint(Rotation.create_group("O").as_matrix())
 
 
 def _kabsch(a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]) -> Float[Array, "3 3"]:
@@ -355,9 +340,11 @@ FEW = 6
 """Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
 
 
-@functools.partial(jax.jit, static_argnames="config")
-def smooth_motion(model: LandmarkModel, observations: Observations, fit: LandmarkFit, config: FitConfig) -> LandmarkFit:
-    """A fit whose joints move as smoothly as `config.smoothness` expects, and as its keypoints allow.
+@jax.jit
+def smooth_motion(
+    model: LandmarkModel, observations: Observations, fit: LandmarkFit, smoothness: float | Float[Array, ""]
+) -> LandmarkFit:
+    """A fit whose joints move as smoothly as `smoothness` expects, and as its keypoints allow.
 
     Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
 
@@ -380,23 +367,23 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
     limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
 
     def run(carry, std):
-        state, kept, smoothness = carry
+        state, kept, held = carry
 
         def residuals(y):
             joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(axes,))(y)
             motion = robust(accelerations(joints) / std, MOTION_SCALE)
             return _person_residuals(problem, seen, y) | {"motion": motion}
 
-        state, outcome = solve(residuals, state, config.person_steps, method="lbfgs", tolerance=TOLERANCE)
+        state, outcome = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
         good = jnp.all(costs(state) <= limit)
-        kept, smoothness = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, smoothness))
-        return (state, kept, smoothness), outcome
+        kept, held = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, held))
+        return (state, kept, held), outcome
 
     start = _bridged(problem, seen, fit.state)
     kept = jax.tree.map(lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state)
     carry = (start, kept, jnp.zeros(()))
-    (_, state, smoothness), outcomes = jax.lax.scan(run, carry, config.smoothness * jnp.asarray(MOTION_LEVELS))
-    return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, smoothness)
+    (_, state, held), outcomes = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
+    return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, held)
 
 
 def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:

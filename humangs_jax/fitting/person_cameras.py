@@ -20,9 +20,8 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import mirrored_name
 from humangs_jax.fitting.person_bundle import Evidence, Rig, adjust, align_views, pixel_errors, place_person
-from humangs_jax.fitting.residuals.keypoints import NOISE, OPTICAL_AXIS, OUTER
+from humangs_jax.fitting.residuals.keypoints import NOISE, OUTER, in_camera_axes
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL, USUAL_STD, EXIF_STD = 29.0, 0.2, 0.03
@@ -120,16 +119,11 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
             warning = f"{seen.photos[out]}: left out: it shows another moment than the others, or was not understood"
             return dataclasses.replace(found, views=tuple(rests[out]), warnings=(*found.warnings, warning))
     found = [cameras_of_moment(seen.select([view]), height=height) for view in every]
-    join = lambda name: np.concatenate([getattr(each, name) for each in found])
-    return PersonCameras(
-        tuple(every),
-        tuple(each.cameras[0] for each in found),
-        join("landmarks"),
-        join("mirrored"),
-        len(found),
-        join("errors"),
-        tuple(dict.fromkeys(warning for each in found for warning in each.warnings)),
-    )
+    warnings = tuple(dict.fromkeys(warning for each in found for warning in each.warnings))
+    names = ("landmarks", "mirrored", "errors")
+    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in names}
+    cameras = tuple(each.cameras[0] for each in found)
+    return PersonCameras(tuple(every), cameras, moments=len(found), warnings=warnings, **joined)
 
 
 def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
@@ -149,16 +143,9 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
         )
     medians = np.asarray([np.median(e[w > SEEN]) for e, w in zip(found.pixels, found.evidence.weights, strict=True)])
     cameras, landmarks = _in_world(seen, rig, height)
-    views = len(cameras)
-    return PersonCameras(
-        tuple(range(views)),
-        cameras,
-        np.broadcast_to(landmarks, (views, *landmarks.shape)),
-        found.mirrored,
-        1,
-        medians,
-        tuple(_warnings(seen, found.mirrored, height)),
-    )
+    views, every = tuple(range(len(cameras))), np.broadcast_to(landmarks, (len(cameras), *landmarks.shape))
+    warnings = tuple(_warnings(seen, found.mirrored, height))
+    return PersonCameras(views, cameras, every, found.mirrored, 1, medians, warnings)
 
 
 def _mirror(seen: PersonViews) -> Int[np.ndarray, " k"]:
@@ -169,12 +156,8 @@ def _mirror(seen: PersonViews) -> Int[np.ndarray, " k"]:
 
 
 def _check(seen: PersonViews, height: float | None) -> None:
-    views = len(seen.points)
-    if not views:
+    if not len(seen.points):
         raise ValueError("no photo of the person: expected one or more")
-    counts = {len(x) for x in (seen.visibility, seen.world, seen.sizes, seen.focal, seen.photos)}
-    if counts != {views} or {len(seen.names)} != {x.shape[1] for x in (seen.points, seen.visibility, seen.world)}:
-        raise ValueError(f"expected points, visibility, world, sizes, focal and photos of {views} views")
     if height is not None and not 0.3 < height < 3:
         raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
     for photo, points, visible in zip(seen.photos, seen.points, _known(seen), strict=True):
@@ -221,11 +204,8 @@ def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[n
     for own, flipped in zip(world, mirrored, strict=True):
         if flipped and _handedness(own, seen.names) < 0:  # the detector saw the body turned round as well
             own[:, 2] *= -1
-    # the detector's own view is of the middle of the hips
-    hips = [name in ("left_hip", "right_hip") for name in seen.names]
-    seen_hips = np.where((weights * hips).all(1, where=np.asarray(hips), keepdims=True), weights * hips, weights)
-    rays = np.asarray([_ray(*own) for own in zip(points, seen_hips, focal, strict=True)])
-    world = np.einsum("cab,ckb->cka", smallest_turns(OPTICAL_AXIS, rays), world)
+    K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
+    world = in_camera_axes(world, points, weights, K, seen.names)
     world = np.asarray([x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)])
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
@@ -236,11 +216,6 @@ def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[n
     places = np.stack([place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)])
     evidence = Evidence(points, weights, noise, world, focal, std, _bones(seen.names))
     return evidence, Rig(shape, rotations, places, focal)
-
-
-def _ray(points: Float[np.ndarray, "k 2"], weights: Float[np.ndarray, " k"], focal: float) -> Float[np.ndarray, "3"]:
-    direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
-    return direction / np.linalg.norm(direction)
 
 
 def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
@@ -325,8 +300,7 @@ def _middle(points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str) -
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    ends = (("left_foot_index", "left_heel"), ("right_foot_index", "right_heel"), ("left_big_toe", "left_heel"))
-    ends = (*ends, ("right_big_toe", "right_heel"))
+    ends = [(f"{side}_{toe}", f"{side}_heel") for toe in ("foot_index", "big_toe") for side in ("left", "right")]
     found = [points[names.index(a)] - points[names.index(b)] for a, b in ends if a in names and b in names]
     if {"nose", "left_ear", "right_ear"} <= set(names):
         found.append(points[names.index("nose")] - _middle(points, names, "ear"))

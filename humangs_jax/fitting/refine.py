@@ -20,10 +20,9 @@ from humangs_jax.body.model import (
     BodyModel,
     BodyPose,
     SurfacePoints,
-    pose_body,
+    person_vertices,
     pose_features,
     pose_points,
-    shape_body,
     without_expression,
 )
 from humangs_jax.core.array_types import Array, Bool, Float, Int
@@ -36,7 +35,6 @@ from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, found_no
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
     Boundary,
-    MaskView,
     Matches,
     body_boundary,
     boundary_points,
@@ -60,7 +58,6 @@ from humangs_jax.fitting.state import (
     pose_of,
     segments,
     solve,
-    with_cameras,
     zero_state,
 )
 from humangs_jax.fitting.triangulation import reprojection_errors
@@ -118,17 +115,15 @@ def usual_config(
     """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the body is to fill the
     masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
     """
-    config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
-    if fitted:
-        config = dataclasses.replace(config, std=FITTED if calibrated else FROM_PERSON, independent=100.0)
+    start = FITTED if calibrated else FROM_PERSON
+    std, options = (start, {"independent": 100.0}) if fitted else (StateStd(), {})
     if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
-        config = dataclasses.replace(config, keypoints_worse=math.inf)
+        options |= {"keypoints_worse": math.inf}
     if tight:
-        config = dataclasses.replace(config, std=dataclasses.replace(config.std, clothing=TIGHT, betas=2.0, body_pose=10.0))
+        std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
     if bare:
-        std = dataclasses.replace(config.std, clothing=SKIN)
-        config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))
-    return config
+        std, options = dataclasses.replace(std, clothing=SKIN), options | {"robust_scales": (1.0, 1.0)}
+    return CaptureRefineConfig(std, fixed_cameras=fixed_cameras, **options)
 
 
 # The state of a capture ----------------------------------------------------------------------------------------------
@@ -161,7 +156,8 @@ def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
     """A capture with cameras, shape and poses of a state, whatever the size of the origin's images; its displacement belonged to
     the shape before, and is left out.
     """
-    (K, cam_from_world), betas, poses = _moved(with_cameras(origin, capture.cameras), state)
+    own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
+    (K, cam_from_world), betas, poses = _moved(own, state)
     cameras = replace(capture.cameras, K=K, cam_from_world=cam_from_world)
     return dataclasses.replace(capture, cameras=cameras, betas=np.asarray(betas), poses=poses, displacement=None)
 
@@ -234,9 +230,8 @@ def solve_round(
         counted = replace(y, clothing=_counted(y.clothing))
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
-    if sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS:
-        return solve(residuals, state, PATIENCE * STEPS, method="lbfgs")
-    return solve(residuals, state, STEPS, method="lm")
+    many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
+    return solve(residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm")
 
 
 # Iterations ----------------------------------------------------------------------------------------------------------
@@ -265,12 +260,11 @@ class Scene:
         self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
         self.edges = mesh_edges(self.faces)
-        self.views = [MaskView(mask, mask_boundary(mask, config.points)) for mask in self.masks]
+        self.boundaries = [mask_boundary(mask, config.points) for mask in self.masks]
         kind = None if keypoints is None else keypoints.set
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        self.keypoints = None if keypoints is None else scaled_observations(capture.cameras, keypoints, 1.0)
         self.observations = None if keypoints is None else scaled_observations(self.cameras, keypoints, self.scale)
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
@@ -295,7 +289,8 @@ class Scene:
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
         boundaries = [body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
-        matches = [match(boundary, view, reach, count) for boundary, view in zip(boundaries, self.views, strict=True)]
+        views = zip(boundaries, self.masks, self.boundaries, strict=True)
+        matches = [match(boundary, mask, other, reach, count) for boundary, mask, other in views]
         return Evidence(
             points=boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
             matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
@@ -308,14 +303,13 @@ class Scene:
         """The keypoints, with the noise that a body finds: a detector's own bias is no evidence against the masks."""
         if self.observations is None:
             return None
-        errors = jnp.asarray(self._errors(capture) * self.scale, jnp.float32)
+        errors = jnp.asarray(self._errors(capture, self.observations), jnp.float32)
         return replace(self.observations, noise=found_noise(errors, self.observations.noise))
 
-    def _errors(self, capture: Capture) -> Float[np.ndarray, "v k"]:
-        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
-        assert self.keypoints is not None
-        cameras = {name: getattr(capture.cameras, name)[:, None] for name in ("K", "cam_from_world")}
-        seen = replace(self.keypoints, **cameras)
+    def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
+        """Errors of the keypoints in pixels; NaN where there is none."""
+        cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
+        seen = replace(seen, K=cameras.K[:, None], cam_from_world=cameras.cam_from_world[:, None])
         errors = _keypoint_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
         known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
         return np.where(known, np.asarray(errors), np.nan)[:, 0]
@@ -333,11 +327,9 @@ class Scene:
         ious = np.asarray([overlap(view.covered, mask) for view, mask in pairs])
         iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
         loss = 0.0 if iou is None else 1 - iou
-        if self.keypoints is not None:
-            errors = self._errors(capture)
-            if np.isfinite(errors).any():
-                keypoints = float(np.nanmedian(errors))
-                loss += keypoints * self.scale / self.height
+        if self.observations is not None and np.isfinite(errors := self._errors(capture, self.observations)).any():
+            median = float(np.nanmedian(errors))
+            keypoints, loss = median / self.scale, loss + median / self.height
         return Score(ious, iou, keypoints, loss)
 
 
@@ -350,8 +342,7 @@ def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) ->
 @jax.jit
 def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose) -> Float[jax.Array, "m n 3"]:
     """Vertices of a person in a batch of m poses, metres."""
-    rest = shape_body(body, betas)
-    return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
+    return jax.lax.map(lambda pose: person_vertices(body, betas, pose), poses)
 
 
 @jax.jit
@@ -414,30 +405,24 @@ def refine_capture(
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if the keypoints are of another
     number of views.
     """
-    _check(capture, keypoints)
+    if keypoints is not None and len(keypoints.points) != capture.view_count:
+        raise ValueError(f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}")
+    masked = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
+    if not masked and (keypoints is None or not (keypoints.confidences > 0).any()):
+        raise CaptureError(
+            "capture", "masks", "none shows anybody, and there are no keypoints: refinement needs one or the other"
+        )
     scene = Scene(capture, keypoints, config)
     state, outcome, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)
     kept = _better(found, before, config.keypoints_worse)
     best, score = (tried, found) if kept else (capture, before)
-    stages = [Stage.of("silhouettes", outcome)]
     kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
     kinds = " and ".join(name for name, value in kinds.items() if value is not None)
     verdict = "kept" if kept else "no sufficient improvement, the start is kept"
-    notes = [f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g} expected std)"]
-    return RefinedCapture(best, _report(capture, best, before, score, tuple(stages), notes))
-
-
-def _check(capture: Capture, keypoints: Keypoints | None) -> None:
-    masks = capture.masks is not None and (np.asarray(capture.masks) > 0.5).any()
-    if keypoints is not None and len(keypoints.points) != capture.view_count:
-        raise ValueError(f"keypoints: of {len(keypoints.points)} views, but the capture has {capture.view_count}")
-    seen = keypoints is not None and (keypoints.confidences > 0).any()
-    if not masks and not seen:
-        raise CaptureError(
-            "capture", "masks", "none shows anybody, and there are no keypoints: refinement needs one or the other"
-        )
+    note = f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g} expected std)"
+    return RefinedCapture(best, _report(capture, best, before, score, Stage.of("silhouettes", outcome), note))
 
 
 def _better(found: Score, before: Score, most_worse: float) -> bool:
@@ -447,19 +432,14 @@ def _better(found: Score, before: Score, most_worse: float) -> bool:
     return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
 
 
-def _report(
-    start: Capture, best: Capture, before: Score, after: Score, stages: tuple[Stage, ...], notes: Sequence[str]
-) -> FitReport:
+def _report(start: Capture, best: Capture, before: Score, after: Score, stage: Stage, note: str) -> FitReport:
     kept = best is not start
-    pairs = {
-        "silhouette_iou": (before.iou, after.iou),
-        "keypoint_error_px": (before.keypoints, after.keypoints),
-        "loss": (before.loss, after.loss),
-    }
+    names = {"silhouette_iou": "iou", "keypoint_error_px": "keypoints", "loss": "loss"}
+    pairs = {name: (getattr(before, key), getattr(after, key)) for name, key in names.items()}
     errors = {name: Change(b, a) for name, (a, b) in pairs.items() if b is not None}
     ious = zip(start.names, start.frames.tolist(), before.ious.tolist(), after.ious.tolist(), strict=True)
     moved = how_far(start, best) if kept else {}
-    notes = [*notes, f"kept: {'refined' if kept else 'start'}"]
+    notes = [note, f"kept: {'refined' if kept else 'start'}"]
     if kept:
         notes.append(
             "moved: focal length x {focal_factor:.4f}, cameras {camera_degrees:.2f} degrees and {camera_cm:.1f} cm, "
@@ -467,17 +447,15 @@ def _report(
         )
         if start.displacement is not None:
             notes.append("the displacement of body.npz is left out: it was made for the shape before")
-    warnings = []
-    if after.iou is not None and after.iou < LEAST_IOU:
-        warnings.append("body and masks do not agree: the start was too far off; `humangs check` shows why")
+    apart = after.iou is not None and after.iou < LEAST_IOU
     return FitReport(
         fitted="refinement",
         kept=kept,
         errors=errors,
         views=tuple(ViewReport(name, frame, iou_before=a, iou_after=b) for name, frame, a, b in ious),
-        stages=stages,
+        stages=(stage,),
         moved=moved,
         violations=limit_violations(best.body.joint_names, best.poses),
         notes=tuple(notes),
-        warnings=tuple(warnings),
+        warnings=("body and masks do not agree: the start was too far off; `humangs check` shows why",) if apart else (),
     )

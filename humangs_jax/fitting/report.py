@@ -4,23 +4,21 @@
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import FINGERS
-from humangs_jax.body.model import EXACT, BodyPose
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import text_table
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
-from humangs_jax.fitting.state import Outcome, pose_prior, violations
+from humangs_jax.fitting.state import Outcome, pose_prior
 from humangs_jax.fitting.swaps import Swap
-from humangs_jax.geometry import quaternion
 
 ROWS = 24
 """Views in the printed table; of more, those that fit worst."""
@@ -153,25 +151,18 @@ def _stage_rows(stages: Sequence[Stage]) -> list[str]:
 
 
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:
-    by_keypoints, by_masks = any(v.keypoints for v in views), any(v.iou_after is not None for v in views)
-    shown = views
-    if len(views) > ROWS:
-        error = lambda view: np.nan_to_num(view.median if by_keypoints else 1 - (view.iou_after or 0.0), nan=np.inf)
-        worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
-        shown = [views[i] for i in sorted(worst)]
-    rows = [["view"]]
-    if by_keypoints or not by_masks:
-        rows[0] += ["keypoints", "median error", "90 % below", "outliers"]
-    rows[0] += ["IoU before", "after"] if by_masks else []
-    for view in shown:
-        row = [view.name]
-        if by_keypoints or not by_masks:
+    error = lambda view: np.nan_to_num(view.median if view.iou_after is None else 1 - view.iou_after, nan=np.inf)
+    worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
+    masks = views[0].iou_after is not None
+    rows = [["view", "IoU before", "after"] if masks else ["view", "keypoints", "median error", "90 % below", "outliers"]]
+    for view in (views[i] for i in sorted(worst)):
+        if not masks:
             errors = [f"{view.median:.1f} px", f"{view.high:.1f} px"] if view.keypoints else ["-", "-"]
-            row += [str(view.keypoints), *errors, f"{view.outliers:.0%}"]
-        if by_masks:
-            known = view.iou_before is not None and np.isfinite(view.iou_before)
-            row += [f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"] if known else ["no mask"]
-        rows.append(row)
+            rows.append([view.name, str(view.keypoints), *errors, f"{view.outliers:.0%}"])
+        elif np.isfinite(view.iou_before):
+            rows.append([view.name, f"{view.iou_before:.3f}", f"{view.iou_after:.3f}"])
+        else:
+            rows.append([view.name, "no mask"])
     lines = text_table(rows)
     return lines if len(views) <= ROWS else [*lines, f"...  {len(views) - ROWS} more that fit better"]
 
@@ -182,8 +173,8 @@ MANY_OUTLIERS = 0.3
 """Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw something else."""
 OFF = 4.0
 """Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows another pose or camera."""
-FAR_BEYOND = 10.0
-"""Degrees beyond a joint's limit from which there is a warning: limits are boxes of rotation vectors, and rough."""
+SLIGHTLY_BEYOND, FAR_BEYOND = 3.0, 10.0
+"""Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits are rough."""
 UNSURE, UNDECIDED = 0.03, 0.1
 """A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is determined: a mean over axes, of
 which knees and fingers have one that turns."""
@@ -203,36 +194,26 @@ GROUPS = {
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
     """Violations of joint limits in a batch of poses, by frame."""
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
-    return tuple(
-        Violation(frame, joint_names[j], "xyz"[axis], float(np.rad2deg(beyond)))
-        for frame, own in enumerate(rotations)
-        for j, axis, beyond in violations(prior, own)
-    )
+    beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
+    found = np.argwhere(beyond > SLIGHTLY_BEYOND)
+    return tuple(Violation(int(m), joint_names[j], "xyz"[axis], float(beyond[m, j, axis])) for m, j, axis in found)
 
 
 def undetermined_joints(
-    joint_names: tuple[str, ...],
-    shown: Bool[np.ndarray, " m"],
-    joint_std: Float[np.ndarray, "m j"] | None,
-    determined: Float[np.ndarray, "m j"] | None,
+    joint_names: tuple[str, ...], joint_std: Float[np.ndarray, "m j"], determined: Float[np.ndarray, "m j"]
 ) -> tuple[str, ...]:
-    """Joints that the views do not determine in the frames `shown`; fingers and other groups as one.
+    """Joints that the views do not determine in m frames; fingers and other groups as one.
 
-    Arguments: joint_std: metres. determined: shares. None: ignored.
+    Arguments: joint_std: metres. determined: shares.
     """
-    unknown = np.zeros((len(shown), len(joint_names)), bool)
-    if joint_std is not None:
-        unknown |= joint_std > UNSURE
-    if determined is not None:
-        unknown |= determined < UNDECIDED
-    counts = dict(zip(joint_names, unknown[shown].sum(0).tolist(), strict=True))
-    counts = {name: count for name, count in counts.items() if count}
+    unknown = (joint_std > UNSURE) | (determined < UNDECIDED)
+    counts = {name: count for name, count in zip(joint_names, unknown.sum(0).tolist(), strict=True) if count}
     found = []
     for group, members in GROUPS.items():
         if all(name in counts for name in members):
             found.append((group, max(counts.pop(name) for name in members)))
     found += counts.items()
-    total = int(shown.sum())
+    total = len(unknown)
     return tuple(name if count == total else f"{name} (in {count} of {total} frames)" for name, count in found)
 
 
@@ -278,16 +259,14 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     rotations, transl_cm of the root.
     """
     a, b = start.cameras, refined.cameras
-    product = functools.partial(jnp.matmul, precision=EXACT)
-    relative = product(b.cam_from_world[:, :3, :3], jnp.swapaxes(a.cam_from_world[:, :3, :3], -1, -2))
-    joints = lambda capture: quaternion.matrix_from_axis_angle(capture.poses.rotations)
-    between = product(jnp.swapaxes(joints(start), -1, -2), joints(refined))
+    turns = lambda cameras: Rotation.from_matrix(np.asarray(cameras.cam_from_world[:, :3, :3], float))
+    joints = lambda capture: Rotation.from_rotvec(np.asarray(capture.poses.rotations, float).reshape(-1, 3))
+    degrees = lambda first, second: float(np.degrees((first.inv() * second).magnitude().mean()))
     length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
-    degrees = lambda rotations: np.degrees(length(quaternion.to_axis_angle(quaternion.from_matrix(rotations))))
     return {
         "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
-        "camera_degrees": float(degrees(relative)),
+        "camera_degrees": degrees(turns(a), turns(b)),
         "camera_cm": 100 * length(b.center - a.center),
-        "joint_degrees": float(degrees(between)),
+        "joint_degrees": degrees(joints(start), joints(refined)),
         "transl_cm": 100 * length(refined.poses.translation - start.poses.translation),
     }

@@ -17,15 +17,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.data.capture_checks import floats
+from humangs_jax.data.capture_checks import expect, floats, required
 from humangs_jax.data.keypoints.keypoints import FINGER_JOINTS, FINGERS, Keypoints
 from humangs_jax.data.photos import load_photos, write_description
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
 from humangs_jax.fitting.triangulation import Similarity, triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.io.arrays import read_npz
+from humangs_jax.geometry.mesh import directions_around, face_crosses, in_front, unit
+from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
 from humangs_jax.io.mesh import read_meshes
@@ -42,10 +43,6 @@ OCCLUDERS = 5
 """Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5 cm wide."""
 LEAST_FACES = 50
 """A surface of a person has at least this many."""
-
-
-View = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
-"""An image and its mask."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,42 +67,31 @@ def read_mesh(path: str | Path, colors: bool = False) -> Any:
     """
     import trimesh
 
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file: expected a mesh (OBJ, PLY, GLB, ...)")
     parts = read_meshes(path, colors=colors)
-    if not parts:
-        raise ValueError(f"{path}: no faces: expected a triangle mesh (a point cloud has to be meshed before)")
+    faces = sum(len(part.faces) for part in parts)
+    if faces < LEAST_FACES:
+        raise ValueError(f"{path}: {faces} faces: expected the surface of a person, at least {LEAST_FACES}, no cloud of points")
     mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
-    bad = int((~np.isfinite(mesh.vertices[np.unique(mesh.faces)])).any(axis=1).sum())
-    if bad:
-        raise ValueError(f"{path}: {bad} corners of faces are not finite numbers: expected a clean mesh")
-    if len(mesh.faces) < LEAST_FACES:
-        raise ValueError(f"{path}: {len(mesh.faces)} faces: expected the surface of a person, at least {LEAST_FACES}")
+    if not (np.isfinite(mesh.vertices[np.unique(mesh.faces)]).all() and mesh.area > 0):
+        raise ValueError(f"{path}: corners that are not finite numbers, or faces without area: expected a clean mesh")
     return mesh
 
 
 def read_scan(path: str | Path, count: int = 30_000) -> Scan:
-    """About `count` points of the outside of a mesh file. Raises: see `read_mesh`; ValueError if the surface has no area."""
+    """About `count` points of the outside of a mesh file. Raises: see `read_mesh`."""
     mesh = read_mesh(path)
-    try:
-        return sample_scan(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), count)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return sample_scan(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), count)
 
 
 def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: int = 30_000) -> Scan:
     """Random points of a surface, uniform over its area.
 
     Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are detected.
-    Raises: ValueError if the surface has no area.
     """
     center = vertices[np.unique(faces)].mean(axis=0)
     corners = vertices[faces] - center
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
-    if not area.sum() > 0:
-        raise ValueError("the faces have no area: expected a surface")
     rng = np.random.default_rng(0)
     ends = np.cumsum(area)
     total = OCCLUDERS * count
@@ -116,32 +102,13 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     weights = np.stack([1 - a - b, a, b], axis=1)
     points = np.einsum("pc,pca->pa", weights, corners[face])
     turned = bool(np.einsum("fa,fa->", corners[:, 0], across) < 0)  # six times the volume
-    outside = np.flatnonzero(seen_from_outside(points, float(np.sqrt(PER_CELL * 0.5 * ends[-1] / total)))[:count])
+    cell = float(np.sqrt(PER_CELL * 0.5 * ends[-1] / total))
+    some = points[:count]
+    seen = [in_front(some, points, forward, cell, BEHIND * cell) for forward in directions_around(VIEWS)]
+    outside = np.flatnonzero(np.any(seen, axis=0))
     chosen = face[outside]
     normals = across[chosen] / area[chosen][:, None] * (-1 if turned else 1)
     return Scan(points[outside] + center, normals, turned, float(1 - len(outside) / count))
-
-
-def seen_from_outside(points: Float[np.ndarray, "p 3"], cell: float) -> Bool[np.ndarray, " p"]:
-    """Which points (p, 3) of a surface are the nearest of their cell in at least one of many depth buffers."""
-    seen = np.zeros(len(points), bool)
-    for forward in directions_around(VIEWS):
-        right = np.linalg.svd(forward[None])[2][1]
-        x, y, depth = np.stack([right, np.cross(forward, right), forward]) @ points.T
-        column, row = ((v - v.min()) / cell for v in (x, y))
-        index = column.astype(int) * (int(row.max()) + 1) + row.astype(int)
-        nearest = np.full(index.max() + 1, np.inf)
-        np.minimum.at(nearest, index, depth)
-        seen |= depth < nearest[index] + BEHIND * cell
-    return seen
-
-
-def directions_around(count: int) -> Float[np.ndarray, "d 3"]:
-    """(d, 3) unit vectors, evenly spread over the sphere (a Fibonacci lattice)."""
-    i = np.arange(count) + 0.5
-    y, turn = 1 - 2 * i / count, np.pi * (3 - np.sqrt(5)) * i
-    radius = np.sqrt(1 - y * y)
-    return np.stack([radius * np.cos(turn), y, radius * np.sin(turn)], axis=1)
 
 
 # Known landmarks ------------------------------------------------------------------------------------------------------
@@ -179,23 +146,16 @@ def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
     """
     path = Path(path)
     with reading(path, "file of joints"):
-        joints = _joints_of_npz(path) if path.suffix == ".npz" else read_json(path)
-        if not isinstance(joints, dict):
-            raise Refused('expected {"left_hip": [x, y, z], ...}')
-        if not joints:
-            raise Refused("no joints: expected three at least")
+        if path.suffix == ".npz":
+            file = ArrayFile.open(path)
+            names = file.array("names").astype(str).ravel().tolist()
+            joints = dict(zip(names, file.numbers("points", (len(names), 3)), strict=True))
+        else:
+            joints = read_json(path)
+        if not (isinstance(joints, dict) and joints):
+            raise Refused('expected {"left_hip": [x, y, z], ...}, three at least')
         checked_joints(joints)
         return {name: np.asarray(point, np.float64) for name, point in joints.items()}
-
-
-def _joints_of_npz(path: Path) -> dict[str, np.ndarray]:
-    arrays, _ = read_npz(path)
-    if missing := {"names", "points"} - set(arrays):
-        raise ValueError(f"{min(missing)}: missing: expected names (k,) and points (k, 3)")
-    names, points = [str(name) for name in arrays["names"]], arrays["points"]
-    if len(names) != len(points):
-        raise ValueError(f"points: {len(points)}, but {len(names)} names: expected one for each")
-    return dict(zip(names, points, strict=True))
 
 
 SCAN_FILE, PLACEMENT = "scan.json", "world_from_scan"
@@ -228,7 +188,7 @@ def render_scan_views(mesh_path: str | Path, out: str | Path, views: int = 8, si
     K = intrinsics_from_fov(FIELD_OF_VIEW, size, size)
     cameras = orbit(jnp.zeros(3), DISTANCE, angles, 0.1, K, size, size)
     colors = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
-    drawn = _draw(align(vertices), np.asarray(mesh.faces), colors, cameras, views)
+    drawn = _draw(align(vertices), np.asarray(mesh.faces), colors, cameras)
     replace_folder(out, lambda folder: _write(folder, drawn, cameras, align), mark=SCAN_FILE)
     return out
 
@@ -254,11 +214,9 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
 def read_placement(file: Path) -> Similarity:
     """The similarity from a scan to the world of its images. Raises: FileError unless it is one."""
     with reading(file, "file of render_scan_views"):
-        content = read_json(file)
-        if not isinstance(content, dict) or PLACEMENT not in content:
-            raise Refused(f"{PLACEMENT}: missing: expected a file that render_scan_views wrote")
-        matrix = floats(content[PLACEMENT], file, PLACEMENT, (4, 4))
-        scale = float(np.cbrt(max(np.linalg.det(matrix[:3, :3]), 0.0)))
+        content = expect(read_json(file), dict, file, "")
+        matrix = floats(required(content, PLACEMENT, file), file, PLACEMENT, (4, 4))
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         rigid = scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < ROUNDING
         if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
             raise Refused(f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0 0 0 1")
@@ -278,27 +236,21 @@ def _into_world(vertices: Float[np.ndarray, "n 3"], up: str | None) -> Similarit
 
 
 def _draw(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "f 3"],
-    colors: Float[np.ndarray, "n 3"],
-    cameras: Camera,
-    views: int,
-) -> Iterator[View]:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], colors: Float[np.ndarray, "n 3"], cameras: Camera
+) -> Iterator[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]:
+    """Images with their masks."""
+    normals, corners = unit(face_crosses(vertices, faces)), jnp.asarray(faces, jnp.int32)
     number = lambda x: jnp.asarray(x, jnp.float32)
-    for view in range(views):
-        camera = cameras[view]
-        fragments = rasterize_mesh(number(vertices), jnp.asarray(faces, jnp.int32), camera)
-        painted = np.asarray(interpolate_attributes(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3)))
+    for camera in cameras:
+        fragments = rasterize_mesh(number(vertices), corners, camera)
+        painted = np.asarray(interpolate_attributes(fragments, corners, number(colors), jnp.ones(3)))
         face = np.asarray(fragments.face_ids)
         facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
         shade = np.where(face >= 0, 0.45 + 0.55 * facing[np.maximum(face, 0)], 1.0)
         yield painted * shade[..., None], (face >= 0).astype(np.float32)
 
 
-def _write(folder: Path, drawn: Iterable[View], cameras: Camera, align: Similarity) -> None:
+def _write(folder: Path, drawn: Iterable[tuple[np.ndarray, np.ndarray]], cameras: Camera, align: Similarity) -> None:
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     listed = []
@@ -309,4 +261,4 @@ def _write(folder: Path, drawn: Iterable[View], cameras: Camera, align: Similari
         matrices = {key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")}
         listed.append({**files, "frame": 0, **matrices})
     write_description(folder, listed, "white")
-    write_json(folder / SCAN_FILE, {"world_from_scan": align.matrix().tolist()}, indent=None)
+    write_json(folder / SCAN_FILE, {PLACEMENT: align.matrix().tolist()}, indent=None)

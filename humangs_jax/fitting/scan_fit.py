@@ -21,6 +21,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_body, without_expression
@@ -44,24 +45,13 @@ from humangs_jax.fitting.residuals.scan import (
     scan_problem,
     scan_residuals,
 )
-from humangs_jax.fitting.scan_files import SCAN_LANDMARKS, Scan, checked_joints, directions_around, read_scan
+from humangs_jax.fitting.scan_files import SCAN_LANDMARKS, Scan, checked_joints, read_scan
 from humangs_jax.fitting.state import MIRROR, FitState, Outcome, half_squares, pose_prior, scale_of, solve, state_of
 from humangs_jax.fitting.triangulation import Similarity, align_robustly
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.mesh import directions_around, face_areas
 
-
-@dataclasses.dataclass(frozen=True)
-class ScanFitConfig:
-    """Settings of a fit to a scan."""
-
-    samples: int = 30_000
-    """Points taken from the scan."""
-    points: int = 2500
-    """Of them, and of the body's vertices, that look for partners."""
-
-
-COARSE_POINTS = 600
-"""The same in the search."""
+COARSE_POINTS, FINE_POINTS = 600, 2500
+"""Points of the scan, and of the body's vertices, that look for partners in the search, and in the last rounds."""
 STEPS, SHAPES = 4, 32
 """Of the solver in a round; coefficients that are fitted."""
 FOLLOWED, TURNED = 16, 2
@@ -175,20 +165,6 @@ class Start:
     cost: float
 
 
-def start_from_landmarks(
-    surface: BodySurface, resting: Float[np.ndarray, "k 3"], points: Float[np.ndarray, "k 3"], known: Float[np.ndarray, " k"]
-) -> Start:
-    """The start from given landmarks.
-
-    Arguments: resting: (k, 3) of the body in its usual pose, metres. points: (k, 3) in the scan. known: (k,) 1 or 0.
-    Raises: ValueError if fewer than three of them are known.
-    """
-    model = surface.landmarks
-    weights = known * np.square(trunk_weights(model.names))
-    align = align_robustly(points, resting, weights, TRUNK_STD)
-    return Start(align, pose_prior(model.joint_names).mean, 0.0)
-
-
 def search_starts(surface: BodySurface, scan: Scan, kept: int) -> list[Start]:
     """The best `kept` starts, of different turns, best first."""
     from scipy.spatial import KDTree
@@ -232,10 +208,9 @@ def _stance_points(
     betas = jnp.zeros(surface.points.directions.shape[-1])
     posed = pose_surface(surface, betas, BodyPose(jnp.asarray(stance, jnp.float32), jnp.zeros(3)))
     vertices, faces = np.asarray(posed[0], np.float64), np.asarray(surface.faces)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = face_areas(vertices, faces)
     chosen = np.random.default_rng(0).choice(len(faces), 10 * POINTS, p=area / area.sum())
-    points = (a + b + c)[chosen] / 3
+    points = vertices[faces[chosen]].mean(axis=1)
     middle = points.mean(axis=0)
     size = np.sqrt(((points - middle) ** 2).sum(axis=1).mean())
     return (points - middle) / size, middle, size
@@ -243,14 +218,11 @@ def _stance_points(
 
 def _grid() -> Float[np.ndarray, "turns 3 3"]:
     """Rotations from all sides: the body's axis along many directions, turned about it in steps."""
-    found = []
+    turns, found = Rotation.from_euler("y", 45 * np.arange(8)[:, None], degrees=True).as_matrix(), []
     for up in directions_around(TURNS):
         side = np.linalg.svd(up[None])[2][1]
-        frame = np.stack([side, up, np.cross(side, up)])
-        for angle in np.arange(8) * np.pi / 4:
-            c, s = np.cos(angle), np.sin(angle)
-            found.append(np.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ frame)
-    return np.stack(found)
+        found.append(turns @ np.stack([side, up, np.cross(side, up)]))
+    return np.concatenate(found)
 
 
 def _different(starts: Sequence[Start], kept: int) -> list[Start]:
@@ -277,8 +249,7 @@ def facing_back(
     swapped = rotations[[model.joint_names.index(mirrored_name(name)) for name in model.joint_names]] * HALF_TURN
     swapped = np.clip(swapped, prior.lower, prior.upper)
     swapped[0] = 0
-    root = np.asarray(quaternion.matrix_from_axis_angle(jnp.asarray(rotations[0], jnp.float32)), np.float64)
-    turn = HALF_TURN[:, None] * root.T
+    turn = HALF_TURN[:, None] * Rotation.from_rotvec(rotations[0]).as_matrix().T
     there = np.asarray(model.joints[0], np.float64)
     move = Similarity(1.0, turn, there - turn @ pelvis)
     return Start(move.after(Similarity(size, np.eye(3), np.zeros(3))).after(start.align), swapped, start.cost)
@@ -337,7 +308,6 @@ SKIN, CLOTH, JOINT_STD = 0.004, 0.015, 0.01
 """Metres: std of a scan on bare skin, and of a body that pokes out of clothes; of clothes off the skin; of given joints."""
 EFFECTIVE = (1500.0, 300.0)
 """Number of independent points that all pairs count for, bare and clothed, because neighbours on a surface err together."""
-DEFAULT_CONFIG = ScanFitConfig()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -365,7 +335,6 @@ def fit_scan(
     joints: dict[str, Float[np.ndarray, "3"]] | None = None,
     clothed: bool = True,
     height: float | None = None,
-    config: ScanFitConfig = DEFAULT_CONFIG,
 ) -> ScanFit:
     """Fit a body to a mesh file, or to a scan in memory.
 
@@ -374,7 +343,7 @@ def fit_scan(
     Raises: ValueError, naming the file, if it holds no usable surface; ValueError for unknown or too few joints.
     """
     if not isinstance(scan, Scan):
-        scan = read_scan(scan, config.samples)
+        scan = read_scan(scan)
     points, known = checked_joints(joints or {})
     if height is not None and not 0.5 < height < 2.6:
         raise ArgumentError("height", f"{height}: expected metres, 0.5 to 2.6")
@@ -382,14 +351,13 @@ def fit_scan(
     known = known * np.asarray(surface.landmarks.known)
     whole = scan_problem(surface, surface.landmarks.joint_names, SHAPES)
     effective = EFFECTIVE[int(clothed)]
-    outside = CLOTH if clothed else SKIN
-    tolerances = Tolerances(*(jnp.float32(x) for x in (SKIN, outside, 1.0)))
+    tolerances = Tolerances(jnp.float32(SKIN), jnp.float32(CLOTH if clothed else SKIN), jnp.float32(1.0))
     given = lambda align: _given(align, points, known, height)
     if known.any():
         resting = BodyPose(jnp.asarray(whole.prior.mean), jnp.zeros(3))
-        betas = jnp.zeros(surface.points.directions.shape[-1])
-        landmarks = np.asarray(landmarks_and_joints(whole, betas, resting)[0], np.float64)
-        start = start_from_landmarks(surface, landmarks, points, known)
+        landmarks = np.asarray(landmarks_and_joints(whole, whole.origin.betas, resting)[0], np.float64)
+        weights = known * np.square(trunk_weights(surface.landmarks.names))
+        start = Start(align_robustly(points, landmarks, weights, TRUNK_STD), whole.prior.mean, 0.0)
         state = start_state(whole, start.rotations)
         for std in LANDMARK_STDS:
             own = dataclasses.replace(given(start.align), std=jnp.float32(std))
@@ -398,14 +366,14 @@ def fit_scan(
     else:
         start, state = search(scan, whole, tolerances, given, effective)
         iterations = (*CLOSER, *FINE)
-    target = Target(scan, start.align, config.points, effective, FINE_NORMAL)
+    target = Target(scan, start.align, FINE_POINTS, effective, FINE_NORMAL)
     if clothed:
         iterations = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations)
     state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
     away, covered = target.distances(whole, state, iterations[-1].gate)
-    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, outcomes)
+    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, outcomes[-1])
     violations = limit_violations(body.joint_names, jax.tree.map(lambda leaf: leaf[None], pose))
     report = dataclasses.replace(report, violations=violations)
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
@@ -431,7 +399,7 @@ def _report(
     up: str,
     distances: Float[np.ndarray, " r"],
     covered: float,
-    outcomes: Sequence[Outcome],
+    outcome: Outcome,
 ) -> FitReport:
     errors = {"scan_near_body": Change(covered)}
     if len(distances):
@@ -443,7 +411,7 @@ def _report(
     notes.append(f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface")
     if scan.turned:
         notes.append("the faces of the file were inside out and have been reversed")
-    last = Stage.of("last round", outcomes[-1])
+    last = Stage.of("last round", outcome)
     settled = last.before - last.after < SETTLED * last.before
     if not settled:
         notes.append("the body was still moving in the last round")
@@ -467,7 +435,7 @@ def place_upright(
     Returns: the pose there, the similarity from the file's coordinates to there, and what of the scan is up, in words.
     """
     frame_from_scan = Similarity(size, np.eye(3), np.zeros(3)).after(align)
-    root = np.asarray(quaternion.matrix_from_axis_angle(pose.rotations[0]), np.float64)
+    root = Rotation.from_rotvec(np.asarray(pose.rotations[0], np.float64)).as_matrix()
     axis, up = _up_axis(root[:, 1], frame_from_scan.rotation)
     forward = root[:, 2] - (root[:, 2] @ axis) * axis
     if np.linalg.norm(forward) < 0.1:  # a lying person faces up or down
@@ -479,7 +447,7 @@ def place_upright(
     lowest = (frame_from_scan(scan.points) @ turn.T)[:, 1].min()
     move = -np.asarray([center[0], lowest, center[2]])
     number = lambda x: jnp.asarray(x, jnp.float32)
-    rotations = pose.rotations.at[0].set(quaternion.to_axis_angle(quaternion.from_matrix(number(turn @ root))))
+    rotations = pose.rotations.at[0].set(number(Rotation.from_matrix(turn @ root).as_rotvec()))
     world_from_frame = Similarity(1.0, turn, move)
     return BodyPose(rotations, number(center + move - pelvis)), world_from_frame.after(frame_from_scan), up
 

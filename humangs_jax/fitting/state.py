@@ -25,7 +25,7 @@ residuals whose squares they are:
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -114,16 +114,19 @@ LIMIT_STIFFNESS = 20.0
 """Standard deviations per radian beyond a joint's limit: 3 degrees count as much as one."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Range:
-    """Statistics of a joint's rotation vector, (3,) each: mean, standard deviation, lower and upper limit."""
-
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
+Vector = tuple[float, float, float]
 
 
+class Range(NamedTuple):
+    """Of a joint's rotation vector."""
+
+    mean: Vector
+    std: Vector
+    lower: Vector
+    upper: Vector
+
+
+_UNKNOWN = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED))
 _SPINE = Range((0.03, 0.0, 0.0), (0.2, 0.15, 0.15), (-0.5, -0.5, -0.5), (0.8, 0.5, 0.5))
 _NECK = Range((0.0, 0.0, 0.0), (0.25, 0.3, 0.2), (-0.8, -0.9, -0.6), (0.8, 0.9, 0.6))
 _THUMB = Range((0.1, 0.15, -0.05), (0.3, 0.3, 0.3), (-0.8, -0.9, -1.0), (0.8, 1.2, 0.8))
@@ -131,7 +134,7 @@ _FINGER = Range((0.0, 0.0, -0.35), (0.1, 0.1, 0.5), (-0.4, -0.4, -1.9), (0.4, 0.
 _KNUCKLE = Range((0.0, 0.0, -0.3), (0.15, 0.2, 0.5), (-0.5, -0.6, -1.8), (0.5, 0.6, 0.6))
 
 RANGES = {
-    "pelvis": Range((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED)),
+    "pelvis": _UNKNOWN._replace(std=(1.0, 1.0, 1.0)),
     "spine1": _SPINE,
     "spine2": _SPINE,
     "spine3": _SPINE,
@@ -166,9 +169,14 @@ class PosePrior:
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
     """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no limits."""
-    unknown = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-UNLIMITED, -UNLIMITED, -UNLIMITED), (UNLIMITED, UNLIMITED, UNLIMITED))
-    rows = [_range_of(name, unknown) for name in joint_names]
-    return PosePrior(*(np.stack([row[i] for row in rows]).astype(np.float32) for i in range(4)))
+    rows = []
+    for name in joint_names:
+        row = np.asarray(RANGES.get(name.replace("right_", "left_", 1), _UNKNOWN))
+        if name.startswith("right_"):
+            row = row * np.stack([MIRROR, np.ones(3), MIRROR, MIRROR])
+            row[2:] = np.sort(row[2:], axis=0)
+        rows.append(row)
+    return PosePrior(*np.stack(rows, axis=1).astype(np.float32))
 
 
 def limit_residuals(prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]) -> Float[Array, "a 3"]:
@@ -177,21 +185,6 @@ def limit_residuals(prior: PosePrior, joints: tuple[int, ...], rotations: Float[
     turned = rotations[rows]
     beyond = jnp.maximum(prior.lower[rows] - turned, turned - prior.upper[rows])
     return LIMIT_STIFFNESS * jnp.maximum(beyond, 0.0)
-
-
-def violations(prior: PosePrior, rotations: Float[np.ndarray, "j 3"], slack: float = 0.05) -> list[tuple[int, int, float]]:
-    """(joint, axis, radians beyond the limit) of all components that exceed their limit by more than `slack` radians."""
-    beyond = np.maximum(prior.lower - rotations, rotations - prior.upper)
-    return [(int(j), int(a), float(beyond[j, a])) for j, a in np.argwhere(beyond > slack)]
-
-
-def _range_of(name: str, unknown: Range) -> list[Float[np.ndarray, "3"]]:
-    if not name.startswith("right_"):
-        own = RANGES.get(name, unknown)
-        return [np.asarray(x, float) for x in (own.mean, own.std, own.lower, own.upper)]
-    mean, std, lower, upper = _range_of(name.replace("right_", "left_", 1), unknown)
-    ends = np.sort(np.stack([MIRROR * lower, MIRROR * upper]), axis=0)
-    return [MIRROR * mean, std, ends[0], ends[1]]
 
 
 LOG_SCALE_STD = 0.05
@@ -314,9 +307,8 @@ def zero_state(origin: Origin) -> FitState:
 
 def frame_axes(state: FitState) -> FitState:
     """`in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
-    return replace(
-        state, betas=None, global_orient=0, transl=0, body_pose=0, cameras=None, clothing=None, log_scale=None, places=None
-    )
+    none = jax.tree.map(lambda leaf: None, state)
+    return replace(none, global_orient=0, transl=0, body_pose=0)
 
 
 def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
@@ -382,15 +374,16 @@ def scale_of(state: FitState) -> Float[Array, ""]:
 def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:
     """(j,) 0 for the root, 1 + i for joint `joints[i]`, and for other joints the number of their nearest such ancestor."""
     number = {joint: i + 1 for i, joint in enumerate(joints)} | {parents.index(-1): 0}
-
-    def of(joint):
-        return number[joint] if joint in number else of(parents[joint])
-
-    return np.asarray([of(j) for j in range(len(parents))], np.int32)
+    found = []
+    for joint in range(len(parents)):
+        while joint not in number:
+            joint = parents[joint]
+        found.append(number[joint])
+    return np.asarray(found, np.int32)
 
 
 def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigin:
-    """Views of equal K and cam_from_world are of one camera that stood still; equal focal lengths stay equal."""
+    """Views of equal K and cam_from_world are of one camera; equal focal lengths stay equal."""
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
     focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)
@@ -401,11 +394,6 @@ def camera_numbers(K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v
     """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see below."""
     focal, flat = K[:, :1, 0], lambda values: values.reshape(len(K), -1)
     return _numbered(np.concatenate([np.log(focal), flat(K) / focal, flat(matrices)], axis=1), same)
-
-
-def with_cameras(origin: Origin, cameras: Camera) -> Origin:
-    """The same origin with the K of photos of another size."""
-    return replace(origin, cameras=replace(origin.views, K=cameras.K))
 
 
 def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " n"]:

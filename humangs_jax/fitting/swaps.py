@@ -5,7 +5,6 @@ trial, the clearest first, and reported if the views then agree clearly better:
 
     sides     left and right of the keypoints of one view; needs two views, of which either may be the wrong one
     cameras   of two views, which is the same as their photos; needs three views
-    hands     left and right keypoints of the hands alone, in one view
 
 Left and right exchanged in all views agree as well. Only a fit of the body finds that (`find_mirrored`).
 
@@ -25,11 +24,11 @@ import numpy as np
 from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import Keypoints, KeypointSet
-from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, fit_landmarks
+from humangs_jax.data.keypoints.keypoints import KeypointSet
+from humangs_jax.fitting.landmark_fit import LandmarkFit, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations
 from humangs_jax.fitting.state import camera_numbers
-from humangs_jax.fitting.triangulation import MARGIN, reprojection_errors, triangulate_robustly
+from humangs_jax.fitting.triangulation import agreement, triangulate_robustly
 
 LEAST_GAIN, CHANCE = 0.1, 0.8
 """Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By chance, without an exchange, 17
@@ -41,8 +40,6 @@ ALIKE = 0.9
 """Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras several are equivalent."""
 SAME_CAMERA = 1e-3
 """Share of the focal length, and metres, by which a camera that stands still may differ between frames."""
-HANDS_SHARE = 0.3
-"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance from their own."""
 MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
 """The mirrored person is right if its cost is less than this share of the given one's, or lower by this much."""
 
@@ -51,22 +48,18 @@ MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
 class Swap:
     """One exchange that explains a disagreement; `str()` is a sentence about it.
 
-    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a and b"). gain: how much better
-    the views agree without it, as a share of what is attainable; for "all sides": the share by which the cost of the fit falls.
-    frames: for cameras, in how many; the views are those of the first.
+    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a and b"). frames: for cameras,
+    in how many; the views are those of the first.
     """
 
-    kind: Literal["sides", "cameras", "all sides", "hands"]
-    views: tuple[str, ...]
-    gain: float
+    kind: Literal["sides", "cameras", "all sides"]
+    views: tuple[str, ...] = ()
     instead: tuple[str, ...] = ()
     frames: int = 1
 
     def __str__(self) -> str:
         if self.kind == "all sides":
             return "left and right of the keypoints seem exchanged in all views: the mirrored person fits much better"
-        if self.kind == "hands":
-            return f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the other wrist"
         if self.kind == "cameras":
             frames = f", as in {self.frames} frames" if self.frames > 1 else ""
             other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
@@ -78,56 +71,32 @@ class Swap:
 def find_swaps(
     observations: Observations, kind: KeypointSet, views: Int[np.ndarray, "m c"], names: tuple[str, ...]
 ) -> tuple[Swap, ...]:
-    """Exchanged sides and cameras, the clearest first. Frames need two views for sides and three for cameras.
+    """Exchanged cameras, and then sides. Frames need two views for sides and three for cameras.
 
     Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none, see `group_by_frame`.
     """
     mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
-    order, exchanges, shares = given(*views.shape), [], np.zeros(views.shape)
+    order, exchanges = given(*views.shape), []
     while True:
-        search = _Search(observations, mirror, cameras, order)
-        flips, tried = search.flips(), search.exchanges()
+        flips, tried = _clear_trials(observations, mirror, cameras, order)
         best = max(tried, key=lambda each: each.gain, default=None)
         if best is not None and best.gain >= sum(flips[m].gain for m in best.frames if m in flips):
             exchanges.append(_cameras(best, tried, views, names))
             order = order.exchanged(best.frames, best.a, best.b)
         elif flips:
             frames, slots = (np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a"))
-            shares[frames, order.source[frames, slots]] = [flip.share for flip in flips.values()]
             order = order.exchanged(frames, slots, None)
         else:
-            sides = _sides(observations, views, order, shares, names)
-            return tuple(sorted([*exchanges, *sides], key=lambda swap: -swap.gain))
+            return (*exchanges, *_sides(observations, views, order, names))
 
 
-def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on exchanged crops leave them."""
-    wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
-    if not set(wanted) <= set(keypoints.set.names):
-        return ()
-    rows = [keypoints.set.names.index(name) for name in wanted]
-    left, right, left_wrist, right_wrist = np.moveaxis(keypoints.points[:, rows], 1, 0)
-    seen = (keypoints.confidences[:, rows] > 0).all(1)
-    apart = lambda a, b: np.linalg.norm(a - b, axis=-1)
-    own, other = (apart(left, a) + apart(right, b) for a, b in ((left_wrist, right_wrist), (right_wrist, left_wrist)))
-    exchanged = np.flatnonzero(seen & (other < HANDS_SHARE * own))
-    return tuple(Swap("hands", (names[view],), float(1 - other[view] / own[view])) for view in exchanged)
-
-
-def find_mirrored(
-    model: LandmarkModel, observations: Observations, kind: KeypointSet, fit: LandmarkFit, config: FitConfig
-) -> tuple[Swap, ...]:
-    """Left and right exchanged in all views: the keypoints are mirrored and fitted once more.
-
-    Arguments: fit: of these observations with this configuration (nothing is compiled again).
-    """
+def find_mirrored(model: LandmarkModel, observations: Observations, kind: KeypointSet, fit: LandmarkFit) -> tuple[Swap, ...]:
+    """Left and right exchanged in all views: the keypoints are mirrored and fitted once more. fit: of these observations."""
     everywhere = given(*observations.points.shape[:2], mirrored=True)
     mirrored = arranged(observations, np.asarray(kind.mirror), everywhere)
-    config = dataclasses.replace(config, smoothness=0.0)  # that stage comes later
     # the last stage in units of the expected noise: stage "person" has the noise that each fit found for itself
-    cost, other = (float(x.outcomes["hands"].after.sum()) for x in (fit, fit_landmarks(model, mirrored, config)))
-    better = other < MIRRORED_SHARE * cost or other < cost - MIRRORED_GAIN
-    return (Swap("all sides", (), 1 - other / cost),) if better else ()
+    cost, other = (float(x.outcomes["hands"].after.sum()) for x in (fit, fit_landmarks(model, mirrored)))
+    return (Swap("all sides"),) if other < MIRRORED_SHARE * cost or other < cost - MIRRORED_GAIN else ()
 
 
 # How well views agree --------------------------------------------------------------------------------------------------
@@ -180,124 +149,95 @@ class Agreement(NamedTuple):
 
 
 @jax.jit
-def agreement(observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]) -> Agreement:
+def _agreements(observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]) -> Agreement:
     """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror image."""
-    return jax.lax.map(lambda seen: _of_frame(seen, mirror), observations)
 
+    def of_frame(seen):
+        points, counts, weights = triangulate_robustly(seen)
 
-def _of_frame(seen: Observations, mirror: Int[Array | np.ndarray, " k"]) -> Agreement:
-    points, counts, weights = triangulate_robustly(seen)
+        def near(keypoints, confidences):
+            """Agreement (c,) of all views if each had these keypoints (k, 2)."""
+            everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
+            alike = replace(
+                seen, points=everywhere(keypoints, seen.points), confidences=everywhere(confidences, seen.confidences)
+            )
+            return jnp.sum((counts >= 2) * agreement(alike, points), axis=-1)
 
-    def near(keypoints, confidences):
-        """Agreement (c,) of all views if each had these keypoints (k, 2)."""
-        everywhere = lambda own, of: jnp.broadcast_to(own, of.shape)
-        points_of, certain = everywhere(keypoints, seen.points), everywhere(confidences, seen.confidences)
-        errors = reprojection_errors(replace(seen, points=points_of, confidences=certain), points)
-        share = jnp.maximum(1 - jnp.square(errors / (MARGIN * seen.noise)), 0.0)
-        return jnp.sum((counts >= 2) * certain * share, axis=-1)
+        crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
+        mirrored = jnp.diagonal(jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror]))
+        return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
 
-    crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
-    mirrored = jnp.diagonal(jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror]))
-    return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
+    return jax.lax.map(of_frame, observations)
 
 
 # Trials --------------------------------------------------------------------------------------------------------------
 
 
 class _Trial(NamedTuple):
-    """An exchange in some frames: of cameras a and b, or of the sides of camera a if b is None.
-
-    gain: agreement that it adds; share: gain over what `count` keypoints can attain.
-    """
+    """An exchange in some frames, of cameras a and b, or of the sides of camera a if b is None. gain: agreement that it adds."""
 
     gain: float
-    share: float
-    count: int
     frames: Int[np.ndarray, " e"]
     a: Int[np.ndarray, " e"]
     b: Int[np.ndarray, " e"] | None
 
-    @property
-    def clear(self) -> bool:
-        return self.share > LEAST_GAIN + CHANCE / max(self.count, 1) ** 0.5
 
+def _clear_trials(
+    observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
+) -> tuple[dict[int, _Trial], list[_Trial]]:
+    """The exchanges of keypoints in an order that are clear: by frame that of the sides of one view which adds most; and those of
+    two cameras, in all of their frames together, and in each alone.
 
-class _Search:
-    """Keypoints in an order, how well the views agree, and what exchanges would add.
-
-    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,) agreement. views: (m, c) with
-    keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
+    Arguments: cameras: (m, c) equal numbers for one camera that stands still, -1: no view.
     """
+    seen = arranged(observations, mirror, order)
+    found = jax.tree.map(np.asarray, _agreements(seen, mirror))
+    confidences, frame_count = np.asarray(seen.confidences), len(cameras)
+    shown = (confidences > 0).any(-1)
+    count, own = shown.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
 
-    def __init__(
-        self, observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
-    ) -> None:
-        self.observations, self.mirror, self.cameras, self.order = observations, mirror, cameras, order
-        seen = arranged(observations, mirror, order)
-        found = jax.tree.map(np.asarray, agreement(seen, mirror))
-        self.confidences = np.asarray(seen.confidences)
-        self.total, self.views = found.own.sum(-1), np.asarray((self.confidences > 0).any(-1))
-        count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
-        sides = (count < MANY) | (found.mirrored > own)
-        better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
-        pairs = (count > 2)[..., None] & ((count < MANY)[..., None] | better)
-        self.sides = sides & self.views & (count > 1)
-        self.pairs = pairs & self.views[:, :, None] & self.views[:, None]
-
-    def gains(
-        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None = None
-    ) -> Float[np.ndarray, " e"]:
+    def gains(frames, a, b=None):
         """(e,) agreement that an exchange adds in each of its frames."""
-        order = self.order.exchanged(frames, a, b)
-        own = agreement(arranged(self.observations, self.mirror, order), self.mirror).own
-        return (np.asarray(own).sum(-1) - self.total)[frames]
+        after = _agreements(arranged(observations, mirror, order.exchanged(frames, a, b)), mirror).own
+        return (np.asarray(after).sum(-1) - found.own.sum(-1))[frames]
 
-    def trial(
-        self,
-        gains: Float[np.ndarray, " e"],
-        of: Bool[np.ndarray, " k"],
-        frames: Int[np.ndarray, " e"],
-        a: Int[np.ndarray, " e"],
-        b: Int[np.ndarray, " e"] | None = None,
-    ) -> _Trial:
-        """An exchange with these gains, of the keypoints `of`: attainable is that all agree that another view sees."""
-        seen = (self.confidences > 0) & of
-        shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
-        total = lambda values: sum(values[frames, slots].sum() for slots in (a, b) if slots is not None)
-        most, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
-        gain = float(gains.sum())
-        return _Trial(gain, gain / max(float(most), 1e-6), int(count), frames, a, b)
+    def clear(gain, of, frames, a, b=None):
+        """The exchange of the keypoints `of`, or None: attainable is that all agree that another view sees."""
+        known = (confidences > 0) & of
+        shared = known & (known.sum(axis=1, keepdims=True) > 1)
+        total = lambda values: float(sum(values[frames, slots].sum() for slots in (a, b) if slots is not None))
+        most, number = total((confidences * shared).sum(-1)), total(shared.sum(-1))
+        share = gain / max(most, 1e-6)
+        return _Trial(gain, frames, a, b) if share > LEAST_GAIN + CHANCE / max(number, 1) ** 0.5 else None
 
-    def flips(self) -> dict[int, _Trial]:
-        """The view of each frame whose sides are exchanged most clearly, by frame."""
-        found: dict[int, _Trial] = {}
-        for slot in np.flatnonzero(self.sides.any(0)):
-            frames = np.flatnonzero(self.sides[:, slot])
-            gains = self.gains(frames, np.full(len(frames), slot))
-            for i, frame in enumerate(frames.tolist()):
-                sided = self.mirror != np.arange(len(self.mirror))
-                trial = self.trial(gains[[i]], sided, frames[[i]], np.asarray([slot]))
-                if trial.clear and (frame not in found or trial.gain > found[frame].gain):
-                    found[frame] = trial
-        return found
+    flips: dict[int, _Trial] = {}
+    sides = shown & (count > 1) & ((count < MANY) | (found.mirrored > own))
+    sided, every = mirror != np.arange(len(mirror)), np.ones(len(mirror), bool)
+    for slot in np.flatnonzero(sides.any(0)):
+        frames = np.flatnonzero(sides[:, slot])
+        for frame, gain in zip(frames.tolist(), gains(frames, np.full(len(frames), slot)).tolist(), strict=True):
+            trial = clear(gain, sided, np.asarray([frame]), np.asarray([slot]))
+            if trial is not None and (frame not in flips or gain > flips[frame].gain):
+                flips[frame] = trial
 
-    def exchanges(self) -> list[_Trial]:
-        """Exchanges of two cameras in all of their frames together, and in each alone."""
-        several = self.views & (self.views.sum(-1, keepdims=True) > 2)
-        cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
-        suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
-        tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
-        for a, b in itertools.combinations(range(self.views.shape[1]), 2):
-            frames = np.flatnonzero(several[:, a] & several[:, b])
-            frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
-            if len(frames):
-                gains = self.gains(frames, *(np.full(len(frames), slot) for slot in (a, b)))
-                for frame, gain in zip(frames, gains, strict=True):
-                    tried.setdefault(cameras(frame, a, b), []).append((gain, frame, a, b))
-        alone = [[each] for of in tried.values() if len(of) > 1 for each in of]
-        every = np.ones(len(self.mirror), bool)
-        columns = [map(np.asarray, zip(*group, strict=True)) for group in (*tried.values(), *alone)]
-        return [trial for gains, *where in columns if (trial := self.trial(gains, every, *where)).clear]
+    better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
+    several = shown & (count > 2)
+    pairs = several[:, :, None] & several[:, None] & ((count < MANY)[..., None] | better)
+    numbers = lambda frame, a, b: tuple(sorted(cameras[frame, [a, b]].tolist()))
+    suspected = {numbers(*at) for at in np.argwhere(pairs)}
+    tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
+    for a, b in itertools.combinations(range(cameras.shape[1]), 2):
+        both = [m for m in range(frame_count) if several[m, a] and several[m, b] and numbers(m, a, b) in suspected]
+        if both:
+            frames = np.asarray(both)
+            for frame, gain in zip(both, gains(frames, np.full(len(frames), a), np.full(len(frames), b)), strict=True):
+                tried.setdefault(numbers(frame, a, b), []).append((float(gain), frame, a, b))
+    alone = [[each] for group in tried.values() if len(group) > 1 for each in group]
+    exchanges = []
+    for group in (*tried.values(), *alone):
+        own_gains, *where = map(np.asarray, zip(*group, strict=True))
+        exchanges.append(clear(float(own_gains.sum()), every, *where))
+    return flips, [trial for trial in exchanges if trial is not None]
 
 
 def _cameras(best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]) -> Swap:
@@ -305,24 +245,17 @@ def _cameras(best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"
     name = lambda trial: tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
     alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
     others = [" and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)]
-    return Swap("cameras", name(best), best.share, tuple(others), len(best.frames))
+    return Swap("cameras", name(best), tuple(others), len(best.frames))
 
 
-def _sides(
-    observations: Observations,
-    views: Int[np.ndarray, "m c"],
-    order: Order,
-    shares: Float[np.ndarray, "m c"],
-    names: Sequence[str],
-) -> list[Swap]:
+def _sides(observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]) -> list[Swap]:
     """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
-    for own, mirrored, exists, gains in zip(views, order.mirrored, seen, shares, strict=True):
+    for own, mirrored, exists in zip(views, order.mirrored, seen, strict=True):
         others = own[exists & ~mirrored]
         instead = tuple(names[v] for v in others) if len(others) == mirrored.sum() else ()
-        pairs = zip(own[mirrored], gains[mirrored].tolist(), strict=True)
-        found += [Swap("sides", (names[v],), gain, instead) for v, gain in pairs]
+        found += [Swap("sides", (names[v],), instead) for v in own[mirrored]]
     return found
 
 

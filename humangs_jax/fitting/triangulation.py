@@ -64,22 +64,23 @@ def triangulate_robustly(observations: Observations) -> tuple[Float[Array, "k 3"
     chosen = np.zeros((len(pairs), views, 1), np.float32)
     chosen[np.arange(len(pairs))[:, None], pairs] = 1
 
-    def agreement(points):
-        errors = reprojection_errors(observations, points)
-        return observations.confidences * jnp.maximum(1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0)
-
     def propose(pair):
         points = triangulate(observations, observations.confidences * pair)[0]
-        return points, jnp.sum(agreement(points), axis=0)
+        return points, jnp.sum(agreement(observations, points), axis=0)
 
     # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an agreement of every view
     proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
     best = jnp.argmax(agreed, axis=0)
-    weights = agreement(jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0])
-    agreeing = jnp.sum(weights > 0, axis=0)
-    weights = jnp.where(agreeing >= 2, weights, 0.0)
+    weights = agreement(observations, jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0])
+    weights = jnp.where(jnp.sum(weights > 0, axis=0) >= 2, weights, 0.0)
     points, count = triangulate(observations, weights)
     return points, count, weights
+
+
+def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
+    """How well the views agree with points: their confidences, less for larger errors, 0 beyond the margin."""
+    errors = reprojection_errors(observations, points)
+    return observations.confidences * jnp.maximum(1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0)
 
 
 def reprojection_errors(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
@@ -206,8 +207,6 @@ class Seen(NamedTuple):
 
 Key = tuple[int, int]
 """A view, and a person in it."""
-Proposal = tuple[float, Key, Key, bool, Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]
-"""Error, two people, whether the sides of the second are exchanged, points, and which of them are known."""
 
 
 class Match(NamedTuple):
@@ -229,50 +228,46 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
     """
     flipped_order = np.asarray(mirror)
     left = {(v, p) for v, view in enumerate(views) for p in range(len(view.people))}
-    proposals = []
+    groups = []
     for (v, p), (w, q) in itertools.combinations(sorted(left), 2):
-        if v != w:
-            first, second = views[v].people[p], views[w].people[q]
-            trials = []
-            for row in (second, second[flipped_order]):
-                points, known = _triangulated(views, {v: first, w: row})
-                errors = [_error(views[i], each, points, known) for i, each in ((v, first), (w, row))]
-                trials.append((max(errors), points, known))
-            flipped = _is_exchanged(trials[0][0], trials[1][0])
-            error, points, known = trials[flipped]
-            if error < AGREE:
-                proposals.append((error, (v, p), (w, q), flipped, points, known))
-    groups = [_gathered(views, flipped_order, left, proposal) for proposal in proposals]
+        if v == w:
+            continue
+        first, second = views[v].people[p], views[w].people[q]
+        trials = []
+        for row in (second, second[flipped_order]):
+            points, known = _triangulated(views, {v: first, w: row})
+            error = max(_error(views[i], each, points, known) for i, each in ((v, first), (w, row)))
+            trials.append((error, points, known))
+        flipped = _is_exchanged(trials[0][0], trials[1][0])
+        if trials[flipped][0] < AGREE:
+            groups.append(_gathered(views, flipped_order, {(v, p): False, (w, q): flipped}, *trials[flipped]))
     matches = []
     # the group that most views agree with, and of these the one that agrees best
     for group, error in sorted(groups, key=lambda each: (-len(each[0]), each[1])):
         if all(key in left for key in group):
             left -= set(group)
             matches.append(_match(views, flipped_order, group, error))
-    for key in sorted(left):
-        matches.append(_match(views, flipped_order, {key: False}, float("inf")))
-    return matches
+    return matches + [_match(views, flipped_order, {key: False}, float("inf")) for key in sorted(left)]
 
 
 def _gathered(
-    views: Sequence[Seen], mirror: Int[np.ndarray, " k"], available: set[Key], proposal: Proposal
+    views: Sequence[Seen],
+    mirror: Int[np.ndarray, " k"],
+    pair: dict[Key, bool],
+    error: float,
+    points: Float[np.ndarray, "k 3"],
+    known: Bool[np.ndarray, " k"],
 ) -> tuple[dict[Key, bool], float]:
-    """The members of a proposal and of the other views where they agree: {(view, person): exchanged}, and the error."""
-    _, first, second, flip, points, known = proposal
-    group, errors = {first: False, second: flip}, [proposal[0]]
-    for v in range(len(views)):
-        if v in (first[0], second[0]):
-            continue
+    """A pair, {(view, person): exchanged}, with the people of the other views who agree with its points; and the error."""
+    group, errors = dict(pair), [error]
+    for v in set(range(len(views))) - {v for v, _ in pair}:
         trials = []
         for p, row in enumerate(views[v].people):
-            if (v, p) in available:
-                plain, exchanged = (_error(views[v], each, points, known) for each in (row, row[mirror]))
-                flipped = _is_exchanged(plain, exchanged)
-                trials.append((exchanged if flipped else plain, (v, p), flipped))
-        if not trials:
-            continue
-        error, key, flipped = min(trials)
-        if error < AGREE:
+            plain, exchanged = (_error(views[v], each, points, known) for each in (row, row[mirror]))
+            flipped = _is_exchanged(plain, exchanged)
+            trials.append((exchanged if flipped else plain, (v, p), flipped))
+        if trials and min(trials)[0] < AGREE:
+            error, key, flipped = min(trials)
             group[key] = flipped
             errors.append(error)
     return group, float(np.mean(errors))

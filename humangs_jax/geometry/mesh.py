@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Bool, Float, Int
 
 
 def face_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
@@ -27,9 +27,38 @@ def vertex_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f
     return np.stack([np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1)
 
 
+def edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
+    """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f, 3)."""
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
+    found, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
+    return found, index.reshape(faces.shape)
+
+
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
     """Vectors over their lengths; those without length as they are."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def directions_around(count: int) -> Float[np.ndarray, "d 3"]:
+    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice)."""
+    i = np.arange(count)
+    y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * i
+    radius = np.sqrt(1 - y * y)
+    return np.stack([radius * np.cos(turn), y, radius * np.sin(turn)], axis=1)
+
+
+def in_front(
+    some: Float[np.ndarray, "q 3"], points: Float[np.ndarray, "p 3"], forward: Float[np.ndarray, "3"], cell: float, behind: float
+) -> Bool[np.ndarray, " q"]:
+    """Which of some points are at most `behind` behind the nearest of all points in their cell of a grid across `forward`."""
+    right = np.linalg.svd(forward[None])[2][1]
+    frame = np.stack([right, np.cross(forward, right), forward])
+    every, own = frame @ points.T, frame @ some.T
+    (left, low), rows = every[:2].min(axis=1), int(np.ptp(every[1]) / cell) + 1
+    cells = lambda at: rows * ((at[0] - left) / cell).astype(int) + ((at[1] - low) / cell).astype(int)
+    nearest = np.full(cells(every).max() + 1, np.inf)
+    np.minimum.at(nearest, cells(every), every[2])
+    return own[2] < nearest[cells(own)] + behind
 
 
 def smallest_turns(

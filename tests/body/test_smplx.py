@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.library import assemble_pose, load_body, load_hands, load_smplx
+from humangs_jax.body.library import load_body, load_hands, load_smplx
 from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
 
 DATA = Path(__file__).parent / "data"
@@ -67,14 +67,13 @@ def compare_body(model: Path, arrays: Path) -> list[tuple[str, int, float, float
     number = lambda key, i: jnp.asarray(expected[key][i])
     for convention, (suffix, use_pca, flat_hand_mean) in CONVENTIONS.items():
         for i in range(len(expected["betas"])):
-            pose = assemble_pose(
-                use_pca=use_pca,
-                flat_hand_mean=flat_hand_mean,
-                hands=hands,
-                **{part: number(part, i) for part in PARTS},
-                **{f"{side}_hand_pose": number(f"{side}_hand_{suffix}", i) for side in ("left", "right")},
-                transl=number("transl", i),
-            )
+            hand = [number(f"{side}_hand_{suffix}", i) for side in ("left", "right")]
+            if use_pca:
+                hand = [own @ hands.components[side, : len(own)] for side, own in enumerate(hand)]
+            if not flat_hand_mean:
+                hand = [own + hands.means[side] for side, own in enumerate(hand)]
+            rotations = jnp.concatenate([*(number(part, i).ravel() for part in PARTS), *hand])
+            pose = BodyPose(rotations.reshape(55, 3), number("transl", i))
             found = run(jnp.concatenate([number("betas", i), number("expression", i)]), pose)
             wanted = [expected[f"{convention}_{name}"][i] for name in ("vertices", "joints", "full_pose")]
             vertices, joints, rotations = (
@@ -214,52 +213,3 @@ def test_what_is_no_model_is_refused(tmp_path):
     for name in ("text.npz", "text.pkl", "list.pkl"):
         with pytest.raises(ValueError, match=name):
             load_smplx(tmp_path / name)
-
-
-def test_hands_are_explicit():
-    hands = load_hands(MODEL)
-    flat = assemble_pose(use_pca=False, flat_hand_mean=True)
-    assert np.array_equal(flat.rotations, np.zeros((55, 3)))
-    mean = assemble_pose(use_pca=False, flat_hand_mean=False, hands=hands)
-    assert np.allclose(mean.rotations[25:40].ravel(), hands.means[0], atol=ATOL)
-    assert np.allclose(mean.rotations[40:].ravel(), hands.means[1], atol=ATOL)
-    one = assemble_pose(use_pca=True, flat_hand_mean=True, hands=hands, right_hand_pose=jnp.asarray([0, 2.0]))
-    assert np.allclose(one.rotations[40:].ravel(), 2 * hands.components[1, 1], atol=ATOL)
-    assert np.array_equal(one.rotations[:40], np.zeros((40, 3)))
-    with pytest.raises(TypeError, match="flat_hand_mean"):
-        assemble_pose(use_pca=False)
-    for options in ({"use_pca": False, "flat_hand_mean": False}, {"use_pca": True, "flat_hand_mean": True}):
-        with pytest.raises(ValueError, match=r"left_hand_pose.*hand basis"):
-            assemble_pose(**options, left_hand_pose=jnp.zeros(12))
-    with pytest.raises(ValueError, match="right_hand_pose: expected at most 45"):
-        assemble_pose(use_pca=True, flat_hand_mean=True, hands=hands, right_hand_pose=jnp.zeros(46))
-
-
-def test_parts_go_to_their_joints():
-    parts = {
-        "global_orient": [0.0, 1, 2],
-        "body_pose": np.arange(3, 66.0).reshape(21, 3),
-        "jaw_pose": [66.0, 67, 68],
-        "leye_pose": [69.0, 70, 71],
-        "reye_pose": [72.0, 73, 74],
-        "left_hand_pose": np.arange(75, 120.0),
-        "right_hand_pose": np.arange(120, 165.0).reshape(15, 3),
-    }
-    pose = assemble_pose(use_pca=False, flat_hand_mean=True, transl=[1.0, 2, 3], **parts)
-    assert np.array_equal(pose.rotations, np.arange(165.0).reshape(55, 3))
-    assert np.array_equal(pose.translation, [1, 2, 3])
-    for name, shape in (("body_pose", (66,)), ("jaw_pose", (4,)), ("left_hand_pose", (12,)), ("transl", (4,))):
-        with pytest.raises(ValueError, match=name):
-            assemble_pose(use_pca=False, flat_hand_mean=True, **{name: np.zeros(shape)})
-
-
-def test_poses_assemble_under_vmap_and_jit():
-    hands = load_hands(MODEL)
-    numbers = jnp.asarray(np.random.default_rng(0).normal(size=(4, 12)), jnp.float32)
-    assemble = lambda x: assemble_pose(use_pca=True, flat_hand_mean=False, hands=hands, left_hand_pose=x)
-    batch = jax.jit(jax.vmap(assemble))(numbers)
-    assert np.allclose(batch.rotations[2], assemble(numbers[2]).rotations, atol=ATOL)
-    body = load_smplx(MODEL)
-    rest = shape_body(body, jnp.zeros(1))
-    vertices = jax.jit(jax.vmap(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices))(batch.rotations, batch.translation)
-    assert vertices.shape == (4, 75, 3) and np.isfinite(vertices).all()

@@ -200,7 +200,7 @@ def test_what_cannot_be_fitted_is_one_error(folder, change, message):
         ({"confidences": np.full((20, 133), np.nan)}, "confidences: expected finite"),
         ({"noise": np.zeros(2)}, "noise: expected"),
         ({"determined": None}, "determined: missing"),
-        ({"names": np.asarray([{}], object)}, "names: expected plain arrays"),
+        ({"names": np.asarray([{}], object)}, "names: a pickled object"),
     ],
 )
 def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message):

@@ -17,9 +17,9 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.fitting import refine as module
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, Score, refine_capture, start_state, usual_config
+from humangs_jax.fitting.report import Stage
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
-    MaskView,
     body_boundary,
     distances,
     mask_boundary,
@@ -203,7 +203,9 @@ def test_a_displacement_of_the_shape_before_is_left_out():
     start = dataclasses.replace(truth(), displacement=np.zeros(truth().body.template.shape, np.float32))
     origin = module.capture_origin(start, start.cameras, CONFIG)
     best, score = module.moved_capture(start, origin, start_state(origin, CONFIG)), Score(np.zeros(VIEWS), 0.9, None, 0.1)
-    told = [module._report(start, *pair, score, (), ()).notes for pair in ((best, score), (start, score))]
+    told = [
+        module._report(start, *pair, score, Stage("", 1, 1, 1.0, 1.0, 1.0), "").notes for pair in ((best, score), (start, score))
+    ]
     assert best.displacement is None and ["left out" in " ".join(notes) for notes in told] == [True, False]
 
 
@@ -335,17 +337,17 @@ def test_points_find_the_mask_in_reach_and_tell_how_far_outside_they_are(sphere)
     boundary = boundary_of(sphere, camera())
     gap = 4.0
     mask = disc(IMAGE_RADIUS + gap)
-    view = MaskView(mask, mask_boundary(mask, COUNT))
-    matches = match(boundary, view, 10.0, COUNT)
+    other = mask_boundary(mask, COUNT)
+    matches = match(boundary, mask, other, 10.0, COUNT)
     assert matches.weights.shape == (2 * COUNT,) and float(matches.weights.mean()) == 1.0
     off = distances(matches, jnp.asarray(boundary.positions, jnp.float32))
     np.testing.assert_allclose(off, -gap, atol=0.35)  # inside; polygons and the nearest of 90 points make up the rest
-    assert float(match(boundary, view, 2.0, COUNT).weights.sum()) == 0, "out of reach"
+    assert float(match(boundary, mask, other, 2.0, COUNT).weights.sum()) == 0, "out of reach"
 
 
 def test_an_empty_boundary_matches_nothing(sphere):
     mask = np.zeros((SIDE, SIDE), np.float32)
-    matches = match(boundary_of(sphere, camera()), MaskView(mask, mask_boundary(mask, COUNT)), 10.0, COUNT)
+    matches = match(boundary_of(sphere, camera()), mask, mask_boundary(mask, COUNT), 10.0, COUNT)
     assert float(matches.weights.sum()) == 0
 
 
@@ -355,7 +357,7 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
 
     def cost(gap, clothes):
         mask = disc(IMAGE_RADIUS + gap)
-        matches = match(boundary, MaskView(mask, mask_boundary(mask, COUNT)), 10.0, COUNT)
+        matches = match(boundary, mask, mask_boundary(mask, COUNT), 10.0, COUNT)
         thick = jnp.full(len(pixels), clothes)
         residuals = silhouette_residuals(matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0)
         return float(jnp.sum(jnp.square(residuals)))

@@ -11,14 +11,13 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting import landmark_fit
 from humangs_jax.fitting.fit_capture import _motion_warnings
-from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, keypoint_problem, smooth_motion
+from humangs_jax.fitting.landmark_fit import LandmarkFit, keypoint_problem, smooth_motion
 from humangs_jax.fitting.residuals.keypoints import make_observations
 from humangs_jax.fitting.state import state_of
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 FRAMES, SIZE, NOISE, STD = 7, 512, 1.0, 0.003
 """STD: expected acceleration, metres per frame squared; the true one is 0.002."""
-CONFIG = FitConfig(smoothness=STD, person_steps=100)
 
 
 def true_poses():
@@ -64,7 +63,7 @@ def walk():
     return seen_by(landmarks), tuple(np.asarray(x, np.float32) for x in near), joints
 
 
-def smoothed(seen, start, spoilt=(), config=CONFIG):
+def smoothed(seen, start, spoilt=()):
     """The result; frames that are spoilt start where a fit of nothing would: at rest in the world's origin."""
     rotations, translations = (x.copy() for x in start)
     rotations[list(spoilt)], translations[list(spoilt)] = 0, 0
@@ -72,7 +71,7 @@ def smoothed(seen, start, spoilt=(), config=CONFIG):
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations))
     state = states_of(rotations, translations)
     fit = LandmarkFit(state.betas, poses, jnp.zeros((FRAMES, 8, 3)), nothing, seen.noise, state, {}, jnp.zeros(()), jnp.ones(8))
-    return smooth_motion(MODEL, seen, fit, config)
+    return smooth_motion(MODEL, seen, fit, STD)
 
 
 def centimetres(fit, joints):

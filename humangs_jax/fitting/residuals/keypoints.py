@@ -62,12 +62,11 @@ def make_observations(
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, scale: float) -> Observations:
-    """Keypoints of images of another scale: a batch of views, each with one view (c = 1)."""
+    """Keypoints of images of another scale: a batch of views, each with one view (c = 1), and the noise of all."""
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
     arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
-    seen = make_observations(*(x[None] for x in arrays))
-    by_view = {name: getattr(seen, name)[0][:, None] for name in ("points", "confidences", "K", "cam_from_world")}
-    return replace(seen, **by_view, noise=jnp.broadcast_to(seen.noise, (len(points),)))
+    noise = expected_noise(points[None], keypoints.confidences[None])
+    return replace(make_observations(*(x[:, None] for x in arrays)), noise=jnp.asarray(np.repeat(noise, len(points))))
 
 
 def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
@@ -82,25 +81,29 @@ def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Obse
     cameras = photos.cameras
     world = None
     if keypoints.world is not None and views.shape[1] == 1:  # several views say more than any of them alone
-        hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
-        own = np.where((confidences * hips).any(-1, keepdims=True), confidences * hips, confidences)
-        world = _in_camera_axes(keypoints.world[views], points, own, np.asarray(cameras.K)[views])
+        K = np.asarray(cameras.K)[views]
+        world = in_camera_axes(keypoints.world[views], points, confidences, K, keypoints.set.names)
     return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views], world), views
 
 
-def _in_camera_axes(
-    world: Float[np.ndarray, "m c k 3"],
-    points: Float[np.ndarray, "m c k 2"],
-    weights: Float[np.ndarray, "m c k"],
-    K: Float[np.ndarray, "m c 3 3"],
-) -> Float[np.ndarray, "m c k 3"]:
-    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the camera."""
+def in_camera_axes(
+    world: Float[np.ndarray, "*b k 3"],
+    points: Float[np.ndarray, "*b k 2"],
+    weights: Float[np.ndarray, "*b k"],
+    K: Float[np.ndarray, "*b 3 3"],
+    names: tuple[str, ...],
+) -> Float[np.ndarray, "*b k 3"]:
+    """Landmarks in the axes of the camera, from those of a detector whose z axis is the ray to the middle of the hips, or where
+    they are not seen to that of all points.
+    """
+    hips = np.asarray([kind_of(name) == "hip" for name in names])
+    weights = np.where((weights > 0).all(-1, where=hips, keepdims=True), weights * hips, weights)
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
     focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
     rays = np.concatenate([np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1)
     turns = smallest_turns(OPTICAL_AXIS, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
-    return np.einsum("mcab,mckb->mcka", turns, world)
+    return np.einsum("...ab,...kb->...ka", turns, world)
 
 
 def expected_noise(points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]) -> Float[np.ndarray, " m"]:
@@ -154,8 +157,12 @@ def keypoint_residuals(
 ) -> Float[Array, "c k 2"]:
     """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
     errors = keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
-    weights = observations.confidences * np.asarray(model.known, np.float32)
-    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)[..., None] * robust(errors, scale)
+    return _roots(observations.confidences * np.asarray(model.known, np.float32))[..., None] * robust(errors, scale)
+
+
+def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
+    """Square roots, differentiable where they are 0."""
+    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)
 
 
 def world_residuals(
@@ -168,8 +175,7 @@ def world_residuals(
     total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
     ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
     errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
-    known = weights > 0
-    return jnp.where(known, jnp.sqrt(jnp.where(known, weights, 1.0)), 0.0) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
+    return _roots(weights) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
 
 
 @pytree_dataclass

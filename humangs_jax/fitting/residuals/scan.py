@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
-from humangs_jax.body.model import BodyModel, BodyPose, SurfacePoints, pose_features, pose_points
+from humangs_jax.body.model import BodyModel, BodyPose, SurfacePoints, pose_features, pose_points, surface_points
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
@@ -75,7 +75,7 @@ def body_surface(body: BodyModel, names: tuple[str, ...], vertices: int = VERTIC
     hands = [j for j, name in enumerate(small.joint_names) if is_hand(name)]
     bare = np.asarray(small.skinning_weights)[:, hands].sum(axis=1)
     return BodySurface(
-        points=SurfacePoints(small.template, small.shape_directions, small.pose_directions, small.skinning_weights),
+        points=surface_points(small),
         faces=small.faces,
         order=jnp.asarray(np.argsort(np.argsort(np.asarray(small.collapse_order))), jnp.int32),
         covered=1 - jnp.asarray(bare, jnp.float32),

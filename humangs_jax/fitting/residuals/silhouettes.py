@@ -13,19 +13,20 @@ distances outwards count in full, and distances inwards count less and less the 
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import map_coordinates
 
-from humangs_jax.body.model import BodyModel, SurfacePoints
+from humangs_jax.body.model import BodyModel, SurfacePoints, surface_points
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.state import robust
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.mesh import unit
-from humangs_jax.network.maps import sample_bilinear
+from humangs_jax.geometry.mesh import edges, unit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 PROBE = 1.5
@@ -40,24 +41,22 @@ SMOOTHING = 1.5
 """Pixels: standard deviation of the blur whose gradient is a mask's normal."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MeshEdges:
+class MeshEdges(NamedTuple):
     """Edges of a triangle mesh. ends: (e, 2) vertices. faces: (e, 2) on both sides, -1: none."""
 
     ends: Int[np.ndarray, "e 2"]
     faces: Int[np.ndarray, "e 2"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class BodyView:
+class BodyView(NamedTuple):
     """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals: (n, 2) of the surface at the
     vertices as unit directions in the image. covered: (h, w).
     """
 
-    pixels: Float[np.ndarray, "n 2"]
-    depths: Float[np.ndarray, " n"]
-    normals: Float[np.ndarray, "n 2"]
-    covered: Bool[np.ndarray, "h w"]
+    pixels: Float[Array | np.ndarray, "n 2"]
+    depths: Float[Array | np.ndarray, " n"]
+    normals: Float[Array | np.ndarray, "n 2"]
+    covered: Bool[Array | np.ndarray, "h w"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,9 +75,8 @@ class Boundary:
 
 def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
     """All edges of a mesh; of more than two faces that share an edge, two are kept."""
-    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    ends, edge = np.unique(sides, axis=0, return_inverse=True)
-    edge, owner = edge.reshape(-1), np.repeat(np.arange(len(faces)), 3)
+    ends, sides = edges(faces)
+    edge, owner = sides.ravel(), np.repeat(np.arange(len(faces)), 3)
     beside = np.full((len(ends), 2), -1)
     beside[edge, 0] = owner  # the last of an edge's faces; then the first
     beside[edge[::-1], 1] = owner[::-1]
@@ -88,13 +86,11 @@ def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
 
 def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
     """Project and rasterize a posed body."""
-    return BodyView(*(np.asarray(x) for x in _look(vertices, faces, camera)))
+    return jax.tree.map(np.asarray, _look(vertices, faces, camera))
 
 
 @jax.jit
-def _look(
-    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
-) -> tuple[Float[Array, "n 2"], Float[Array, " n"], Float[Array, "n 2"], Bool[Array, "h w"]]:
+def _look(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
@@ -102,19 +98,19 @@ def _look(
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
     normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2] / focal
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
+    return BodyView(pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0)
 
 
-def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges, count: int) -> Boundary:
+def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int) -> Boundary:
     """`count` points of the body's silhouette, or none if the image shows none."""
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
     before = (view.depths > NEAREST_EDGE)[faces].all(axis=1)
-    first, second = edges.faces.T
+    first, second = mesh.faces.T
     turns = (towards[first] != towards[second]) | (second < 0)
     chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))
-    ends = edges.ends[chosen]
+    ends = mesh.ends[chosen]
     normals = unit(view.normals[ends].sum(axis=1))
     middles = view.pixels[ends].mean(axis=1)
     outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(middles, view.covered.shape)
@@ -187,21 +183,11 @@ class Matches:
     weights: Float[Array, " e"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MaskView:
-    """A mask (h, w) with its silhouette."""
-
-    mask: Float[np.ndarray, "h w"]
-    boundary: Boundary
-
-
-def match(body: Boundary, view: MaskView, reach: float, count: int) -> Matches:
-    """At most 2 `count` equations, padded with weight 0. reach: pixels, how far points look."""
-    own = _ends_of_mask(body, view.mask, reach)
-    other = _nearest(body, view.boundary, reach)
-    rows = [np.concatenate(pair) for pair in zip(own, other, strict=True)]
-    missing = 2 * count - len(rows[0])
-    points, normals, offsets = (np.pad(x, ((0, missing),) + ((0, 0),) * (x.ndim - 1)) for x in rows)
+def match(body: Boundary, mask: Float[np.ndarray, "h w"], boundary: Boundary, reach: float, count: int) -> Matches:
+    """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels, how far points look."""
+    pairs = zip(_ends_of_mask(body, mask, reach), _nearest(body, boundary, reach), strict=True)
+    rows = [np.concatenate(pair) for pair in pairs]
+    points, normals, offsets = (padded(x, 2 * count) for x in rows)
     weights = np.arange(2 * count) < len(rows[0])
     to = lambda x: jnp.asarray(x, jnp.float32)
     return Matches(jnp.asarray(points, jnp.int32), to(normals), to(offsets), to(weights))
@@ -215,7 +201,7 @@ def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) 
     """For points of the body, along their normals: where the mask goes from inside to outside."""
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
-    covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
+    covered = map_coordinates(mask, np.moveaxis(places[..., ::-1], -1, 0) - 0.5, order=1, mode="nearest")
     seen = inside_image(places, mask.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
     nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
@@ -225,11 +211,6 @@ def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) 
     along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(found, inner - outer, 1.0)
     offsets = np.sum(body.normals * body.positions, axis=-1) + along
     return np.flatnonzero(found), body.normals[found], offsets[found]
-
-
-@jax.jit
-def _coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
-    return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
 
 
 def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
@@ -275,21 +256,27 @@ def silhouette_residuals(
 
 def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int) -> SurfacePoints:
     """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
-    fill = lambda x: np.pad(x, ((0, count - len(x)),) + ((0, 0),) * (x.ndim - 1))
-    ends = jnp.asarray(np.stack([fill(boundary.ends) for boundary in boundaries]))
-    shares = jnp.asarray(np.stack([fill(boundary.shares) for boundary in boundaries]))
+    ends, shares = (np.stack([padded(getattr(each, name), count) for each in boundaries]) for name in ("ends", "shares"))
     return _between(body, ends, shares, coefficients)
 
 
+def padded(rows: np.ndarray, count: int) -> np.ndarray:
+    """So many rows, the last of them 0."""
+    return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
+
+
 @functools.partial(jax.jit, static_argnames="coefficients")
-def _between(body: BodyModel, ends: Int[Array, "v p 2"], shares: Float[Array, "v p"], coefficients: int) -> SurfacePoints:
+def _between(
+    body: BodyModel, ends: Int[Array | np.ndarray, "v p 2"], shares: Float[Array | np.ndarray, "v p"], coefficients: int
+) -> SurfacePoints:
+    points = surface_points(body)
+    points = replace(points, directions=points.directions[..., :coefficients])
+
     def one(ends, shares):
         def of(values):
             share = shares.reshape(-1, *(1,) * (values.ndim - 1))
             return (1 - share) * values[ends[:, 0]] + share * values[ends[:, 1]]
 
-        corrections = None if body.pose_directions is None else of(body.pose_directions)
-        directions = body.shape_directions[..., :coefficients]
-        return SurfacePoints(of(body.template), of(directions), corrections, of(body.skinning_weights))
+        return jax.tree.map(of, points)
 
     return jax.vmap(one)(ends, shares)
