@@ -125,7 +125,7 @@ RIDGE = 1e-13
 """Relative to the trace of the normal equations, which are singular where a shape direction moves nothing."""
 
 
-def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float | np.floating) -> np.ndarray:
+def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
     """Points on the faces, corners included, about `spacing` apart."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -139,7 +139,7 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float | np
 
 def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is not hidden."""
-    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
     return np.mean([in_front(vertices, points, forward, cell, 2 * cell) for forward in directions_around(VIEWS)], axis=0)

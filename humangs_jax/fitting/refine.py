@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +117,8 @@ def usual_config(
     masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
     """
     start = FITTED if calibrated else FROM_PERSON
-    std, options = (start, {"independent": 100.0}) if fitted else (StateStd(), {})
+    std = start if fitted else StateStd()
+    options: dict[str, Any] = {"independent": 100.0} if fitted else {}
     if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
         options |= {"keypoints_worse": math.inf}
     if tight:

@@ -53,10 +53,10 @@ class BodyView(NamedTuple):
     vertices as unit directions in the image. covered: (h, w).
     """
 
-    pixels: Float[Array | np.ndarray, "n 2"]
-    depths: Float[Array | np.ndarray, " n"]
-    normals: Float[Array | np.ndarray, "n 2"]
-    covered: Bool[Array | np.ndarray, "h w"]
+    pixels: Float[np.ndarray, "n 2"]
+    depths: Float[np.ndarray, " n"]
+    normals: Float[np.ndarray, "n 2"]
+    covered: Bool[np.ndarray, "h w"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,11 +86,11 @@ def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
 
 def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
     """Project and rasterize a posed body."""
-    return jax.tree.map(np.asarray, _look(vertices, faces, camera))
+    return BodyView(*map(np.asarray, _look(vertices, faces, camera)))
 
 
 @jax.jit
-def _look(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
+def _look(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> tuple[Array, Array, Array, Array]:
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
@@ -98,7 +98,7 @@ def _look(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camer
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
     normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2] / focal
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return BodyView(pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0)
+    return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
 
 
 def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int) -> Boundary:
