@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -118,14 +117,14 @@ def usual_config(
     """
     start = FITTED if calibrated else FROM_PERSON
     std = start if fitted else StateStd()
-    options: dict[str, Any] = {"independent": 100.0} if fitted else {}
+    config = CaptureRefineConfig(fixed_cameras=fixed_cameras, independent=100.0 if fitted else CaptureRefineConfig.independent)
     if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
-        options |= {"keypoints_worse": math.inf}
+        config = dataclasses.replace(config, keypoints_worse=math.inf)
     if tight:
         std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
     if bare:
-        std, options = dataclasses.replace(std, clothing=SKIN), options | {"robust_scales": (1.0, 1.0)}
-    return CaptureRefineConfig(std, fixed_cameras=fixed_cameras, **options)
+        std, config = dataclasses.replace(std, clothing=SKIN), dataclasses.replace(config, robust_scales=(1.0, 1.0))
+    return dataclasses.replace(config, std=std)
 
 
 # The state of a capture ----------------------------------------------------------------------------------------------
