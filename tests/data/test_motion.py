@@ -11,7 +11,6 @@ from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.library import HandBasis
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.cli import animate
 from humangs_jax.core.registry import imported
@@ -65,20 +64,11 @@ def smpl_params(**changes):
     return {k: v for k, v in {**parts, **changes}.items() if v is not None}
 
 
-def test_hand_conventions(tmp_path):
-    """Principal coefficients and mean hands need the model's basis, and are used as it says."""
-    basis = HandBasis(jnp.asarray(random((2, 45), 5), jnp.float32), jnp.asarray(random((2, 45, 45), 6), jnp.float32))
-    parts = smpl_params(left_hand_pose=random((FRAMES, 12), 7), right_hand_pose=None)
-    path = write(tmp_path / "a.npz", **parts)
-    with pytest.raises(MotionError, match="left_hand_pose: 12 numbers are principal coefficients"):
-        load_motion(path)
-    flat = np.asarray(load_motion(path, hands=basis).rotations)[:, 25:40].reshape(FRAMES, 45)
-    np.testing.assert_allclose(flat, parts["left_hand_pose"] @ np.asarray(basis.components)[0, :12], atol=FLOAT32)
-    mean = np.asarray(load_motion(path, hands=basis, flat_hand_mean=False).rotations)
-    np.testing.assert_allclose(mean[:, 25:40].reshape(FRAMES, 45), flat + np.asarray(basis.means)[0], atol=FLOAT32)
-    assert (mean[:, 40:] == 0).all()  # a hand that the file does not have stays flat
-    with pytest.raises(ValueError, match="needs the mean hand"):
-        load_motion(path, flat_hand_mean=False)
+def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path, caplog):
+    parts = smpl_params(left_hand_pose=random((FRAMES, 12), 7))
+    rotations = np.asarray(load_motion(write(tmp_path / "a.npz", **parts)).rotations)
+    assert not rotations[:, 25:40].any() and rotations[:, 40:].any()
+    assert "left_hand_pose: hands of 12 numbers are principal coefficients of a model: left flat" in caplog.text
 
 
 def lhm_frame(i, **changes):
@@ -347,20 +337,6 @@ def test_grounded_stands_on_the_floor_at_the_origin():
     np.testing.assert_allclose(joints[0, 0, [0, 2]], 0, atol=FLOAT32)
     sole = float(rest.joints[:, 1].min() - rest.vertices[:, 1].min())
     np.testing.assert_allclose(joints[..., 1].min(), sole, atol=FLOAT32)
-
-
-@pytest.mark.parametrize("columns", [165, 156])
-def test_amass_adds_the_mean_hand_where_asked(tmp_path, columns):
-    basis = HandBasis(jnp.asarray(random((2, 45), 5), jnp.float32), jnp.asarray(random((2, 45, 45), 6), jnp.float32))
-    path = write(tmp_path / "a.npz", poses=upright_poses(columns), trans=np.zeros((FRAMES, 3)), mocap_framerate=30)
-    flat, mean = (load_motion(path, hands=basis, flat_hand_mean=x).rotations.reshape(FRAMES, -1) for x in (True, False))
-    np.testing.assert_array_equal(mean[:, :75], flat[:, :75])
-    added = np.broadcast_to(np.asarray(basis.means).ravel(), (FRAMES, 90))
-    np.testing.assert_allclose(mean[:, 75:] - flat[:, 75:], added, atol=FLOAT32)
-    body = load_motion(write(tmp_path / "b.npz", **(AMASS | {"poses": upright_poses(66)})), hands=basis, flat_hand_mean=False)
-    assert not np.asarray(body.rotations)[:, 22:].any()  # no hands, nothing to add to
-    with pytest.raises(MotionError, match="our own format holds whole rotations"):
-        load_motion(write(tmp_path / "c.npz", **OURS), hands=basis, flat_hand_mean=False)
 
 
 def test_at_rate_keeps_frames_and_interpolates_between_them():

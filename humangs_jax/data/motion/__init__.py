@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.library import HandBasis
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
@@ -94,8 +93,6 @@ def _between(
 class Reading(NamedTuple):
     """What `load_motion` was asked, as readers need it; see there."""
 
-    hands: HandBasis | None = None
-    flat_hand_mean: bool = True
     fps: float | None = None
     person: int | None = None
     clip: str | None = None
@@ -126,8 +123,6 @@ def load_motion(
     fps: float | int | None = None,
     person: int | None = None,
     clip: str | int | None = None,
-    hands: HandBasis | None = None,
-    flat_hand_mean: bool = True,
     rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
 ) -> Motion:
     """Read a motion; suffix and content decide the format (docs/motions.md).
@@ -138,9 +133,6 @@ def load_motion(
             the format's own, or another one along which people stand on a floor, which is logged as a warning
             (`rules.up_axis`).
         fps: frames per second in place of those in the file.
-        hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers and for `flat_hand_mean` False.
-        flat_hand_mean: False adds the mean hand to hands that a file has. Our own format holds whole rotations: there is
-            nothing to add.
         rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other
             programs are brought to it, and a motion of another number of joints is refused. None: the shipped body.
         person: the number of the person, in a file of several.
@@ -157,15 +149,13 @@ def load_motion(
     """
     if up not in ("auto", *rules.UPRIGHT):
         raise ValueError(f"up: expected auto, {', '.join(rules.UPRIGHT)}, got {up!r}")
-    if hands is None and not flat_hand_mean:
-        raise ValueError("flat_hand_mean=False needs the mean hand: pass hands")
     if path is None:
         with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
             return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
     with reading(path, "motion", MotionError):
-        options = Reading(hands, flat_hand_mean, None if fps is None else float(fps), person, None if clip is None else str(clip))
+        options = Reading(None if fps is None else float(fps), person, None if clip is None else str(clip))
         return _load(Path(path), up, options, rest_joints)
 
 

@@ -14,14 +14,13 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
 from humangs_jax.data.motion import MotionError, Poses, Reading, skeleton
-from humangs_jax.data.motion.people import SHOWN, Person, expected, format_of, read_people
+from humangs_jax.data.motion.people import SHOWN, Person, are_rotations, format_of, read_people
 from humangs_jax.data.motion.rules import (
     COLUMNS,
     HAND_NUMBERS,
     MILLIMETRES,
     NO_PLACES,
     NO_RATE,
-    ORTHONORMAL,
     PELVIS,
     joint_places,
 )
@@ -39,21 +38,18 @@ NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     """The poses of one person. Raises: MotionError, naming the key."""
-    person = _chosen(path, read_people(path, MotionError), options.person)
-    file, form = _MotionFile(path, person, options), format_of(person.values)
+    person = _chosen(path, read_people(path), options.person)
+    file, form = _MotionFile(path, person, options.fps), format_of(person.values)
     assert form is not None
     if form.kind == "points":
         return clip_of_points(file, file.rate(form))
-    rotations = _whole(file, form) if form.kind == "ours" else _posed(file, form)
+    rotations = file.numbers(form.poses["all"], (None, None, 3)) if form.kind == "ours" else _posed(file, form)
     moves = _placed(file, form, rotations)
     frames = person.frames if person.frames is not None and len(person.frames) == len(rotations) else None
-    rate = file.rate(form)
-    return Poses(rotations, moves, rate, form.up, form.fixed, form.also, frames, "; ".join(file.said))
+    return Poses(rotations, moves, file.rate(form), form.up, form.fixed, form.also, frames, "; ".join(file.said))
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
-    if not people:
-        raise MotionError(path, "", expected({}))
     names = [person.name for person in people]
     if number is None and len(people) == 1:
         return people[0]
@@ -63,10 +59,10 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
         if 0 <= number < len(people) and not any(name.isdigit() for name in names):
             return people[number]
     counted = ", ".join(f"{person.name or 0} ({_frames(person)} frames)" for person in people[:SHOWN])
-    more = ", ..." if len(people) > SHOWN else ""
+    counted += ", ..." if len(people) > SHOWN else ""
     if number is not None:
-        raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}{more}")
-    raise MotionError(path, "", f"{len(people)} people: {counted}{more}: expected person, the number of one of them")
+        raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}")
+    raise MotionError(path, "", f"{len(people)} people: {counted}: expected person, the number of one of them")
 
 
 def _frames(person: Person) -> int:
@@ -77,99 +73,68 @@ def _frames(person: Person) -> int:
 # Rotations ------------------------------------------------------------------------------------------------------------
 
 
-def _whole(file: "_MotionFile", form: ArrayKeys) -> Rotations:
-    (key,) = form.poses.values()
-    if not file.flat_hand_mean:
-        raise MotionError(file.path, key, "our own format holds whole rotations: expected flat_hand_mean=True")
-    return file.numbers(key, (None, None, 3))
-
-
 def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
     rotations: Rotations | None = None
-    count = None
     for place, key in form.poses.items():
-        if key not in file.values and count is not None:
+        if rotations is not None and key not in file.values:
             continue
-        first = PLACES[place][0]
-        part = _part(file, form, place, key, count)
+        values = file.numbers(key, None)
         if rotations is None:
-            count = len(part)
-            rotations = np.zeros((count, len(JOINT_NAMES), 3))
+            single = values.ndim == 1 or (place == "root" and values.shape == (3, 3) and are_rotations(values))
+            rotations = np.zeros((1 if single else len(values), len(JOINT_NAMES), 3))
+        count = len(rotations)
+        flat = values.reshape(count, -1) if count == 1 or len(np.atleast_1d(values)) == count else np.zeros((count, 0))
+        part = _all(file, form, key, values, flat) if place == "all" else _part(file, place, key, values, flat)
         if form.pivot == "origin" and place == "all":  # the root's own rotation, before that about the origin
             part = part.copy()
             part[:, 0] = (Rotation.from_rotvec(rotations[:, 0]) * Rotation.from_rotvec(part[:, 0])).as_rotvec()
+        first = PLACES[place][0]
         rotations[:, first : first + part.shape[1]] = part
     assert rotations is not None
     return rotations
 
 
-def _part(file: "_MotionFile", form: ArrayKeys, place: str, key: str, count: int | None) -> Rotations:
-    values = file.numbers(key, None)
-    most = PLACES[place][1]
-    if count is None:
-        single = place == "root" and values.shape == (3, 3) and _orthonormal(values[None])
-        count = 1 if single or values.ndim == 1 else len(values)
-    flat = values.reshape(count, -1) if count == 1 or (values.ndim and len(values) == count) else None
-    if place in ("left_hand", "right_hand", "hands"):
-        return _hands(file, place, key, values, flat, count)
-    if place == "all":
-        return _all(file, form, key, values, flat)
-    for joints in (most, most + 2 if place in ("limbs", "body") else most):
-        if flat is not None and flat.shape[1] in (3 * joints, 9 * joints):
+def _part(file: "_MotionFile", place: str, key: str, values: np.ndarray, flat: Float[np.ndarray, "m columns"]) -> Rotations:
+    most, (count, width) = PLACES[place][1], flat.shape
+    of_smpl = place in ("limbs", "body")
+    for joints in (most, most + 2) if of_smpl else (most,):
+        if width in (3 * joints, 9 * joints):
             return _axis_angles(file, key, flat, joints)[:, :most]
-    of_smpl = f", or ({count}, {3 * most + 6}) of SMPL" if place in ("limbs", "body") else ""
-    raise MotionError(file.path, key, f"expected shape ({count}, {3 * most}){of_smpl}, got {values.shape}")
+    if 3 * most == HAND_NUMBERS and 0 < width < HAND_NUMBERS:
+        file.said.append(f"{key}: {NO_HANDS.format(width)}")
+        return np.zeros((count, most, 3))
+    shapes = f"({count}, {3 * most})" + (f", or ({count}, {3 * most + 6}) of SMPL" if of_smpl else "")
+    raise MotionError(file.path, key, f"expected shape {shapes}, got {values.shape}")
 
 
-def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, flat: np.ndarray | None) -> Rotations:
+def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, flat: Float[np.ndarray, "m columns"]) -> Rotations:
     """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the fingers."""
-    width = 0 if flat is None else flat.shape[1]
-    if flat is not None and form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
-        pose = flat.reshape(len(flat), 53, 3)
+    count, width = flat.shape
+    if form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
+        pose = flat.reshape(count, 53, 3)
         return np.concatenate([pose[:, :22], pose[:, 52:], np.zeros_like(pose[:, :2]), pose[:, 22:52]], axis=1)
-    if flat is not None and form.pivot == "origin" and width in (69, 78, 87):  # without the root; with coefficients of hands
-        if width == 69:
-            return np.pad(flat, ((0, 0), (3, 0))).reshape(len(flat), -1, 3)[:, :22]
+    if form.pivot == "origin" and width == 69:  # without the root
+        return np.pad(flat, ((0, 0), (3, 0))).reshape(count, -1, 3)[:, :22]
+    if form.pivot == "origin" and width in (78, 87):  # with coefficients of hands
         file.said.append(NO_HANDS.format(6))
-        return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(len(flat), -1, 3)
-    if flat is not None and width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
+        return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(count, -1, 3)
+    if width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
         joints = width // 3 if width in (75, *COLUMNS) else width // 9
         pose = _axis_angles(file, key, flat, joints)
         if joints < 52:  # the last two of 24 are whole hands, the last three of 25 jaw and eyes
             return pose if joints == 25 else pose[:, :22]
-        face = pose[:, 22:25] if joints == len(JOINT_NAMES) else np.zeros((len(pose), 3, 3))
-        return np.concatenate([pose[:, :22], face, pose[:, -30:] + file.means], axis=1)
+        face = pose[:, 22:25] if joints == len(JOINT_NAMES) else np.zeros((count, 3, 3))
+        return np.concatenate([pose[:, :22], face, pose[:, -30:]], axis=1)
     words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
     joints = f", {width // 3} joints" if width % 3 == 0 else ""
     raise MotionError(file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}")
-
-
-def _hands(file: "_MotionFile", place: str, key: str, values: np.ndarray, flat: np.ndarray | None, count: int) -> Rotations:
-    """Of one hand or both: fewer numbers are principal coefficients."""
-    first, joints = PLACES[place]
-    width, side = 0 if flat is None else flat.shape[1], int(place == "right_hand")
-    if flat is not None and width in (3 * joints, 9 * joints):
-        pose = _axis_angles(file, key, flat, joints)
-    elif flat is not None and joints == 15 and 0 < width < HAND_NUMBERS:
-        if file.hands is None:
-            problem = f"{width} numbers are principal coefficients: they need the hand basis of a model (hands)"
-            raise MotionError(file.path, key, problem)
-        pose = (flat @ np.asarray(file.hands.components)[side, :width]).reshape(-1, 15, 3)
-    else:
-        raise MotionError(file.path, key, f"expected shape ({count}, {3 * joints}), got {values.shape}")
-    return pose + file.means[first - 25 :][:joints]
-
-
-def _orthonormal(matrices: Float[np.ndarray, "*n 3 3"]) -> bool:
-    squares = matrices @ np.swapaxes(matrices, -1, -2)
-    return bool(np.abs(squares - np.eye(3)).max(initial=0) < ORTHONORMAL and (np.linalg.det(matrices) > 0).all())
 
 
 def _axis_angles(file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int) -> Rotations:
     if flat.shape[1] == 3 * joints:
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
-    if not _orthonormal(matrices):
+    if not are_rotations(matrices):
         raise MotionError(file.path, key, f"expected rotation matrices, got others than rotations in shape {flat.shape}")
     return Rotation.from_matrix(matrices).as_rotvec().reshape(len(flat), joints, 3)
 
@@ -228,19 +193,17 @@ def _cameras(file: "_MotionFile", count: int) -> tuple[Float[np.ndarray, "m 3 3"
         turns, places = turns[own], places[own]
     else:
         return None
-    if not _orthonormal(turns):
+    if not are_rotations(turns):
         raise MotionError(file.path, "", "expected rotation matrices of cameras")
     return turns, places
 
 
 class _MotionFile(ArrayFile):
-    """The values of a person, how hands are written, and what is to be said."""
+    """The values of a person, and what is to be said."""
 
-    def __init__(self, path: Path, person: Person, options: Reading):
+    def __init__(self, path: Path, person: Person, fps: float | None):
         super().__init__(path, person.values, person.pickled, MotionError)
-        self.hands, self.flat_hand_mean, self.fps = options.hands, options.flat_hand_mean, options.fps
-        added = None if self.flat_hand_mean or self.hands is None else np.asarray(self.hands.means, np.float64)
-        self.means: Float[np.ndarray, "30 3"] = np.zeros((30, 3)) if added is None else added.reshape(30, 3)
+        self.fps = fps
         self.said: list[str] = []
 
     def first(self, keys: tuple[str, ...]) -> str:

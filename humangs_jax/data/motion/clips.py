@@ -116,11 +116,10 @@ def _numbers(text: str) -> Float[np.ndarray, " n"]:
 
 
 def _chained(parents: tuple[int, ...], offsets: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
-    places = offsets.copy()
-    places[0] = 0
+    places = np.zeros_like(offsets)
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            places[joint] += places[parent]
+            places[joint] = places[parent] + offsets[joint]
     return places
 
 

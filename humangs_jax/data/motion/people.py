@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.data.formats import MOTIONS, ArrayKeys
+from humangs_jax.data.motion import MotionError
+from humangs_jax.data.motion.rules import ORTHONORMAL
 from humangs_jax.io.arrays import ArrayFile
-from humangs_jax.io.reading import FileError, Refused, check_limit, open_file, read_json
+from humangs_jax.io.reading import Refused, check_limit, open_file, read_json
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 
@@ -47,43 +49,45 @@ def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
     return next((row for row in rows if all(key in values for key in row.keys)), None)
 
 
-def read_people(path: Path, error: type[FileError]) -> list[Person]:
-    """The people of a file or a folder; none if it has nothing of any format. Raises: FileError; `error`."""
-    if not path.is_dir() and path.suffix.lower() != ".json":
-        content, pickled = _content(path, error)
-        if not (people := _people(content, pickled)):
-            raise error(path, "", expected(content if isinstance(content, dict) else {}))
-        return people
-    files = _files(path, error) if path.is_dir() else [path]
+def read_people(path: Path) -> list[Person]:
+    """The people of a file or a folder. Raises: FileError; Refused if it has nothing of any format."""
+    files, alone = _files(path) if path.is_dir() else [path], not path.is_dir() and path.suffix.lower() != ".json"
     check_limit("frames", len(files), "files")
-    if files[0].suffix.lower() in OF_ONE:
-        return [person for file in files for person in _of_file(file, _people(*_content(file, error)))]
-    return _stacked(_frames(files, error))
+    if not alone and files[0].suffix.lower() not in OF_ONE:
+        people = _stacked(_frames(files))
+    else:
+        people = []
+        for file in files:
+            content, pickled = _content(file)
+            found = _people(content, pickled)
+            if alone and not found:
+                raise Refused(expected(content if isinstance(content, dict) else {}))
+            name = (_numbers(file) or [file.stem])[-1]
+            people += [each._replace(name=name) for each in found] if len(found) == 1 and not alone else found
+    if not people:
+        raise Refused(expected({}))
+    return people
 
 
-def _of_file(file: Path, people: list[Person]) -> list[Person]:
-    return [each._replace(name=(_numbers(file) or [file.stem])[-1]) for each in people] if len(people) == 1 else people
-
-
-def _content(file: Path, error: type[FileError]) -> tuple[Any, tuple[str, ...]]:
+def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
     """What is in a file, and which of it is pickled objects."""
     if file.suffix.lower() == ".json":
         return read_json(file), ()
     with open_file(file) as opened:
         archive = opened.read(2) == b"PK"
     if (archive or file.suffix.lower() == ".npz") and file.suffix.lower() not in (".pt", ".pth"):
-        found = ArrayFile.open(file, error)
+        found = ArrayFile.open(file, MotionError)
         return found.values, found.pickled
     return read_values(file), ()
 
 
-def _files(folder: Path, error: type[FileError]) -> list[Path]:
+def _files(folder: Path) -> list[Path]:
     natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
     for place in (folder / name for name in FOLDERS):
         for suffix in (".json", ".npz", *OF_ONE):
             if files := sorted((file for file in place.glob("*" + suffix) if file.name != "camera.npy"), key=natural):
                 return files
-    raise error(folder, "", "no .json, .npz or other file of a motion in this folder")
+    raise Refused("no .json, .npz or other file of a motion in this folder")
 
 
 def _numbers(file: Path) -> list[str]:
@@ -137,7 +141,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     if place not in ("root", "all") or form.kind != "poses" or key not in values:
         return [Person(name, values)]
     shape = np.shape(as_array(values[key])) if not isinstance(values[key], list) else ()
-    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not _turns(values[key])
+    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not are_rotations(as_array(values[key]))
     several = several or (form.pivot == "head" and len(shape) == 3)
     if not several:
         return [Person(name, values)]
@@ -150,11 +154,12 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     return [Person(str(number), rest | own(i)) for i, number in enumerate(ids.tolist())]
 
 
-def _turns(value: Any) -> bool:
-    array = np.asarray(as_array(value))
-    if array.shape[1:] != (3, 3) or array.dtype.kind not in "fiu":
+def are_rotations(array: np.ndarray) -> bool:
+    """Whether the last two axes of an array are those of rotation matrices."""
+    if array.shape[-2:] != (3, 3) or array.dtype.kind not in "fiu":
         return False
-    return bool(np.abs(array @ np.swapaxes(array, 1, 2) - np.eye(3)).max(initial=0) < 0.1)
+    squares = array @ np.swapaxes(array, -1, -2)
+    return bool(np.abs(squares - np.eye(3)).max(initial=0) < ORTHONORMAL and (np.linalg.det(array) > 0).all())
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
@@ -192,45 +197,42 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
     return people
 
 
-def _frames(files: Sequence[Path], error: type[FileError]) -> list[tuple[Path, list[Person]]]:
+def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
     """The people of each frame. A file whose name ends in two numbers, of which the first changes, is of a frame and a person."""
     numbers = [_numbers(file) for file in files]
     apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1
-    frames: dict[str, tuple[Path, list[Person]]] = {}
+    frames: dict[str, tuple[str, list[Person]]] = {}
     for file, number in zip(files, numbers, strict=True):
-        content = _content(file, error)[0]
+        content = _content(file)[0]
         if not isinstance(content, dict | list):
-            raise error(file, "", f"expected a JSON object, got {type(content).__name__}")
+            raise Refused(f"{file.name}: expected a JSON object, got {type(content).__name__}")
         people = _found(content, "", 0)
         if apart:
             people = [person._replace(name=number[-1]) for person in people]
-        frames.setdefault(number[-2] if apart else str(file), (file, []))[1].extend(people)
+        frames.setdefault(number[-2] if apart else str(file), (file.name, []))[1].extend(people)
         if not people and isinstance(content, dict) and len(files) == 1:
-            raise error(file, "", expected(content))
+            raise Refused(expected(content))
     return list(frames.values())
 
 
-def _stacked(frames: Sequence[tuple[Any, list[Person]]]) -> list[Person]:
-    """People of many frames, from those of each."""
-    people: dict[str, list[tuple[int, Any, Mapping[str, Any]]]] = {}
-    for i, (file, found) in enumerate(frames):
+def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
+    """People of many frames, from those of each, which have a name."""
+    people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
+    for i, (_, found) in enumerate(frames):
         for person in found:
-            people.setdefault(person.name, []).append((i, file, person.values))
+            people.setdefault(person.name, []).append((i, person.values))
     stacked = []
     for name, seen in people.items():
-        (_, first_file, first), form = seen[0], format_of(seen[0][2])
+        begin, first = seen[0]
+        form = format_of(first)
         assert form is not None
         keys = [key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first]
-        for _, file, values in seen:
+        for i, values in seen:
             if missing := set(keys) - set(values):
-                where = first_file.name if isinstance(first_file, Path) else first_file
-                problem = f"missing, but {where} has it"
-                if not isinstance(file, Path):  # the file is named by who reads it
-                    raise Refused(f"{file}: {min(missing)}: {problem}")
-                raise FileError(file, min(missing), problem)
-        values = {key: [objects(values[key]) for _, _, values in seen] for key in keys}
+                raise Refused(f"{frames[i][0]}: {min(missing)}: missing, but {frames[begin][0]} has it")
+        values = {key: [objects(values[key]) for _, values in seen] for key in keys}
         values = {k: [x if isinstance(x, list | int | float) else as_array(x) for x in each] for k, each in values.items()}
-        stacked.append(Person(name, values, np.asarray([i for i, _, _ in seen])))
+        stacked.append(Person(name, values, np.asarray([i for i, _ in seen])))
     return stacked
 
 

@@ -61,30 +61,14 @@ SIDED = {
 MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify, Daz, Advanced Skeleton. A joint
 of the file is taken once, by the first that wants it: "shoulder" is the upper arm where there is no other, else the collar."""
 MIDDLE = {
-    **{"pelvis": ("hips", "hip", "pelvis"), "neck": ("neck", "neck1", "neck01", "necklower")},
-    **{"head": ("head",), "jaw": ("jaw",)},
+    "pelvis": ("hips", "hip", "pelvis"),
+    "neck": ("neck", "neck1", "neck01", "necklower"),
+    "head": ("head",),
+    "jaw": ("jaw",),
 }
 NOISE = (
-    *(
-        "j",
-        "c",
-        "m",
-        "bip",
-        "bip01",
-        "bip001",
-        "bip1",
-        "biped",
-        "def",
-        "org",
-        "jnt",
-        "joint",
-        "bind",
-        "bone",
-        "skin",
-        "sk",
-        "ctrl",
-    ),
-    *("rig", "armature", "character", "valvebiped", "avatar"),
+    *("j", "c", "m", "bip", "bip01", "bip001", "bip1", "biped", "def", "org", "jnt", "joint", "bind", "bone", "skin", "sk"),
+    *("ctrl", "rig", "armature", "character", "valvebiped", "avatar"),
 )
 """Words in names that say nothing of the joint."""
 ENDS = ("end", "nub", "top", "tip", "site")
@@ -271,9 +255,8 @@ def turned_upright(
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT NEEDED TOPS FEET EXPECTED_NAMES
-    FEW STANDING
-    BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS
-    ORTHONORMAL NO_RATE NO_PLACES"""
+    FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING UPRIGHT CLEARLY_UP FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES
+    HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
     formats = [dataclasses.asdict(each.arrays) for each in MOTIONS.values() if each.arrays is not None and each.arrays.page]
