@@ -32,7 +32,6 @@ from humangs_jax.network.presets import tiny
 from tests.refinement.refinement_cases import toy_avatar, toy_capture
 
 DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
-NEEDED = ("cameras", "masks", "keypoints")
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +86,7 @@ def test_alpha_is_a_mask(mine):
 @pytest.mark.parametrize("distortion", [0, 0.1])
 def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
     edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[distortion, 0, 0, 0, 0]) for camera in rig.values()])
-    for name in ("masks", "keypoints"):
-        shutil.rmtree(mine / name)
+    without(mine, "masks", "keypoints")
     for path in (mine / "images").iterdir():
         write_png(path, np.ones((512, 512, 4)))
     found = look(mine)
@@ -97,43 +95,39 @@ def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
     assert load_photos("me").masks is None and "masks and keypoints missing" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", NEEDED)
-def test_what_is_missing_comes_with_its_tools(name, mine, capsys):
-    shutil.rmtree(mine / name, ignore_errors=True)
-    if name == "cameras":
-        (mine / "calibration.json").unlink()
+TOOLS = {
+    "cameras": ("colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images", "EasyMocap"),
+    "masks": ("rembg p -m u2net_human_seg -om photos/images photos/masks", "SAM 2"),
+    "keypoints": ("inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints", "openpose.bin"),
+}
+
+
+def without(folder, *names):
+    for name in names:
+        shutil.rmtree(folder / name) if name != "cameras" else (folder / "calibration.json").unlink()
+
+
+@pytest.mark.parametrize("names", [("cameras",), ("masks",), ("keypoints",), tuple(TOOLS)])
+def test_what_is_missing_comes_with_its_tools(names, mine, capsys):
+    without(mine, *names)
+    if set(names) - {"cameras"}:
+        assert "pip install 'humangs_jax[photos]'" in missing(look(mine))[-1].how[0]
     code = cli.execute(["start", str(mine), "--out", "me"])
     out, err = capsys.readouterr()
+    told = " and ".join(", ".join(names).rsplit(", ", 1))
     assert code == cli.BAD_DATA and err == (
-        f"humangs: error: photos: {name} missing: make them as above and run the same command again\n"
+        f"humangs: error: photos: {told} missing: make them as above and run the same command again\n"
     )
-    tools = {
-        "cameras": ("colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images", "EasyMocap"),
-        "masks": ("rembg p -m u2net_human_seg -om photos/images photos/masks", "SAM 2"),
-        "keypoints": ("inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints", "openpose.bin"),
-    }
-    for other, lines in tools.items():
-        assert all((line in out) == (other == name) for line in lines), out
-    if name == "cameras":
-        assert not Path("me").exists()
+    for other, lines in TOOLS.items():
+        assert all((line in out) == (other in names) for line in lines), out
+    if "cameras" in names:
+        assert list(Path().iterdir()) == [mine]
     else:  # what is there was imported
         assert load_photos("me").images.shape == (4, 512, 512, 3) and not Path("me/body.npz").exists()
 
 
-def test_all_that_is_missing_is_told_at_once(mine, capsys):
-    for name in ("masks", "keypoints"):
-        shutil.rmtree(mine / name)
-    (mine / "calibration.json").unlink()
-    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
-    out, err = capsys.readouterr()
-    assert "photos: cameras, masks and keypoints missing: make them" in err and [
-        line for line in out.splitlines() if line.endswith("missing")
-    ]
-    assert list(Path().iterdir()) == [mine]
-
-
 def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
-    shutil.rmtree(mine / "keypoints")
+    without(mine, "keypoints")
     edit_json(mine / "calibration.json", lambda rig: [camera.update(dist=[0.1, 0, 0, 0, 0]) for camera in rig.values()])
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "inferencer_demo.py me/images --pose2d" in capsys.readouterr().out
@@ -161,18 +155,17 @@ def detected(mine, monkeypatch):
     return told
 
 
-@pytest.mark.parametrize("without", [("keypoints",), ("masks",), ("masks", "keypoints")])
-def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(without, mine, detected, capsys):
+@pytest.mark.parametrize("names", [("keypoints",), ("masks",), ("masks", "keypoints")])
+def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(names, mine, detected, capsys):
     shutil.rmtree(mine)
     write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
-    for name in without:
-        shutil.rmtree(mine / name)
-    options = ["--person", "1"] if len(without) == 2 else []  # what is given says who is meant
+    without(mine, *names)
+    options = ["--person", "1"] if len(names) == 2 else []  # what is given says who is meant
     assert cli.execute(["start", str(mine), "--out", "me", *options]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert err == "humangs: error: the fit\n" and f"{' and '.join(without)} found in the photos: me/people.png" in out
+    assert err == "humangs: error: the fit\n" and f"{' and '.join(names)} found in the photos: me/people.png" in out
     (material,) = detected
-    assert material.keypoints == (Path("me/keypoints.json") if "keypoints" in without else mine / "keypoints")
+    assert material.keypoints == (Path("me/keypoints.json") if "keypoints" in names else mine / "keypoints")
     imported = load_photos("me")
     np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
 
@@ -213,21 +206,10 @@ def test_check_compares_a_capture_without_keypoints_with_what_is_found(mine, det
     assert not (DEMO / "keypoints.json").exists()
 
 
-def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected, capsys):
-    for name in ("masks", "keypoints"):
-        shutil.rmtree(mine / name)
-    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
-    assert "2 people in 0_00.png, 0_01.png, 0_02.png, 0_03.png: expected one. Person 0 to 1: numbers on me/people.png" in (
-        capsys.readouterr().err
-    )
-    assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None
-
-
+@pytest.mark.slow  # finds the cameras
 def test_photos_alone_are_enough(mine, detected, capsys):
     """Cameras, masks and keypoints are those of the person; only LiteRT is needed."""
-    for name in ("masks", "keypoints"):
-        shutil.rmtree(mine / name)
-    (mine / "calibration.json").unlink()
+    without(mine, *TOOLS)
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
     assert err.endswith("humangs: error: the fit\n") and "cameras from the person: " in out
@@ -247,10 +229,10 @@ def test_steps_on_the_head_are_for_calibrated_cameras(calibrated, mine, detected
     asked = []
     monkeypatch.setattr(Start, "_fit", lambda self, material, one_moment=None: (None, None))
     monkeypatch.setattr(Start, "_finish", lambda self, capture, estimate, limits: asked.append(limits))
+    found = photos_alone.PhotosImported((), (), detect.found_in_capture("me"), 1, True)
+    monkeypatch.setattr(photos_alone, "import_photos", lambda _, out, **options: out.mkdir() or found)
     if not calibrated:
-        for name in ("masks", "keypoints"):
-            shutil.rmtree(mine / name)
-        (mine / "calibration.json").unlink()
+        without(mine, *TOOLS)
     assert cli.execute(["start", str(mine), "--out", "me"]) == 0
     monkeypatch.setattr(Start, "_resumes", lambda self: True)
     monkeypatch.setattr(capture_module, "load_capture", lambda path, fit_masks: None)
@@ -282,42 +264,37 @@ def test_a_height_without_a_use_is_refused(mine, detected, capsys):
     assert "--height: is for photos without cameras" in capsys.readouterr().err
 
 
-def test_several_people_without_cameras_are_refused_with_a_sheet(mine, detected, monkeypatch, capsys):
-    (mine / "calibration.json").unlink()
+@pytest.mark.parametrize(("calibrated", "sheet"), [(True, "me/people.png"), (False, "me_people.png")])
+def test_two_people_are_refused_with_the_sheet_that_numbers_them(calibrated, sheet, mine, detected, monkeypatch, capsys):
+    without(mine, "masks", "keypoints", *([] if calibrated else ["cameras"]))
     found = detect.found_in_capture(Path("me"))
-    monkeypatch.setattr(
-        detect, "detect_photos", lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)]
-    )
+    named = lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)]
+    monkeypatch.setattr(detect, "detect_photos", named)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
-    assert "numbers on me_people.png" in capsys.readouterr().err
-    assert Path("me_people.png").is_file() and not Path("me").exists()
+    assert f"expected one. Person 0 to 1: numbers on {sheet}" in capsys.readouterr().err
+    assert Path(sheet).is_file() and not detected
     assert cli.execute(["start", str(mine), "--out", "me", "--person", "5"]) == cli.BAD_USAGE
-    assert "--person 5: expected 0 to 1, as on me_people.png" in capsys.readouterr().err and not Path("me").exists()
+    assert f"--person 5: expected 0 to 1, as on {sheet}" in capsys.readouterr().err
+    assert Path("me").exists() == calibrated  # what was imported stays
 
 
-def test_without_the_detector_its_extra_is_named_first(mine):
-    for name in ("masks", "keypoints"):
-        shutil.rmtree(mine / name)
-    assert all("pip install 'humangs_jax[photos]'" in each.how[0] for each in missing(look(mine)))
-
-
-@pytest.mark.parametrize("given", ["clips", "clips/me.MP4"])
-def test_a_video_becomes_photos_beside_the_capture(given, tmp_path, monkeypatch, capsys):
+def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys):
     """Once: a second run goes on with these, and what was added to them; another video under that name is refused."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(blazepose, "available", lambda: False)
     Path("clips").mkdir()
     scenes = np.random.default_rng(0).uniform(0.1, 0.9, (3, 4, 6, 3))
     write_video(Path("v.mp4"), [np.kron(scenes[i // 5], np.ones((12, 12, 1))) for i in range(15)], 10)
     Path("v.mp4").rename("clips/me.MP4")
-    command = ["start", given, "--out", "out/me", "--no-browser"]
-    assert cli.execute(command) == cli.BAD_DATA  # nobody is in it
+    command = ["start", "clips/me.MP4", "--out", "out/me", "--no-browser"]
+    assert cli.execute(command) == cli.BAD_DATA  # there are no cameras
     assert "clips/me.MP4: 3 of 15 frames" in capsys.readouterr().out
     photos = sorted(Path("out/me_photos/images").iterdir())
     assert [int(path.stem[-8:]) // 5 for path in photos] == [0, 1, 2]
     Path("out/me_photos/masks").mkdir()
     shutil.copy(photos[0], "out/me_photos/masks")
     before = {path: path.stat().st_mtime_ns for path in photos}
-    assert cli.execute(command) == cli.BAD_DATA
+    assert cli.execute([command[0], "clips", *command[2:]]) == cli.BAD_DATA  # the only video of a folder
     out = capsys.readouterr().out
     assert "3 of 15 frames" in out and "masks:     out/me_photos/masks" in out
     assert {path: path.stat().st_mtime_ns for path in photos} == before
@@ -360,21 +337,13 @@ def test_folders_without_photos_and_captures_are_refused(mine, tmp_path):
         look(mine, keypoints=Path("none.json"))
 
 
-def test_a_body_that_is_there_is_not_replaced(mine, capsys):
-    Path("me").mkdir()
-    for name in ("capture.json", "body.npz"):
-        Path("me", name).write_text("mine")
-    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
-    assert "--out me: the folder is not empty" in capsys.readouterr().err
-    assert Path("me/body.npz").read_text() == "mine"
-
-
-@pytest.mark.parametrize("files", [("capture.json", "pose.npz"), ("capture.json", "body.npz", "fit.json")])
+@pytest.mark.parametrize(
+    "files", [("capture.json", "body.npz"), ("capture.json", "pose.npz"), ("capture.json", "body.npz", "fit.json")]
+)
 def test_a_capture_of_something_else_is_not_replaced(files, mine, capsys):
     Path("me").mkdir()
     for name in files:
         Path("me", name).write_text("mine")
-    shutil.rmtree(mine / "keypoints")
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
     assert "--out me: the folder is not empty" in capsys.readouterr().err
     assert {path.name: path.read_text() for path in Path("me").iterdir()} == dict.fromkeys(files, "mine")
@@ -424,29 +393,36 @@ def body():
     return decimate(load_body(), 400)
 
 
-def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, monkeypatch):
-    avatar, capture, given = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.0), views=4), []
-    monkeypatch.setattr(start, "reconstruct", lambda _, __, others: given.append(others.names) or avatar)
-    found = held_out_psnr({}, tiny(), capture, None)
-    assert set(capture.names) - set(given[0]) == {found.name} and len(given[0]) == 4  # a copy in its place
+@pytest.fixture(scope="module")
+def toy(body):
+    """A capture of an avatar, and what is reconstructed of it: by how much the avatar is off."""
+    return toy_capture(body, toy_avatar(body, 0.0), views=4)
+
+
+def reconstructed(monkeypatch, body, wrong):
+    """wrong: by how much the avatar of a capture is off."""
+    monkeypatch.setattr(start, "SIZE", 64)
+    monkeypatch.setattr(start, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong(photos)))
+
+
+def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy, monkeypatch):
+    given = []
+    reconstructed(monkeypatch, body, lambda others: given.append(others.names) or 0.0)
+    found = held_out_psnr({}, tiny(), toy, None)
+    assert set(toy.names) - set(given[0]) == {found.name} and len(given[0]) == 4  # a copy in its place
     assert found.psnr > 25 and found.name in str(found)
-    monkeypatch.setattr(start, "reconstruct", lambda *_: toy_avatar(body, 0.15))
-    assert held_out_psnr({}, tiny(), capture, None).psnr < found.psnr - 3
+    reconstructed(monkeypatch, body, lambda _: 0.15)
+    assert held_out_psnr({}, tiny(), toy, None).psnr < found.psnr - 3
+    for few in (toy.select([0, 1, 2]), dataclasses.replace(toy, masks=None)):
+        assert held_out_psnr({}, tiny(), few, None) is None
 
 
-def test_few_photos_and_photos_without_masks_hold_none_out(body):
-    capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
-    assert held_out_psnr({}, tiny(), capture.select([0, 1, 2]), None) is None
-    assert held_out_psnr({}, tiny(), dataclasses.replace(capture, masks=None), None) is None
-
-
-def test_the_body_with_the_better_avatar_is_taken(body, monkeypatch):
-    capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
-    other, wrong = dataclasses.replace(capture, body_file="other"), {}
-    monkeypatch.setattr(start, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong[photos.body_file]))
-    for first, second, taken in ((0.15, 0.0, other), (0.0, 0.15, capture), (0.0, 0.0, capture)):
-        wrong |= {capture.body_file: first, "other": second}
-        found, estimate = better_body({}, tiny(), capture, other, None)
+def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
+    other, wrong = dataclasses.replace(toy, body_file="other"), {}
+    reconstructed(monkeypatch, body, lambda photos: wrong[photos.body_file])
+    for first, second, taken in ((0.15, 0.0, other), (0.0, 0.15, toy), (0.0, 0.0, toy)):
+        wrong |= {toy.body_file: first, "other": second}
+        found, estimate = better_body({}, tiny(), toy, other, None)
         assert found is taken and estimate.psnr > 25
-    few = capture.select([0, 1])
+    few = toy.select([0, 1])
     assert better_body({}, tiny(), few, other, None) == (few, None)
