@@ -215,7 +215,6 @@ def png(name, shape, level=0.5):
 
 
 MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
-SINGULAR = np.zeros((4, 4)).tolist()
 NOT_FINITE = [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]
 
 BAD = {
@@ -225,67 +224,42 @@ BAD = {
     "a JSON list": (lambda f: (f / "capture.json").write_text("[]"), "capture.json", "expected a JSON object"),
     "format": (top(format="colmap"), "capture.json: format", "colmap"),
     "version": (top(version=2), "capture.json: version", "expected 1"),
-    "body key": (top(body=3), "capture.json: body", "3"),
     "background": (top(background="black"), "capture.json: background", "black"),
     "no views": (top(views=[]), "capture.json: views", "at least one"),
-    "views no list": (top(views={}), "capture.json: views", "list"),
     "view no object": (top(views=["a.png"]), "capture.json: views[0]", "object"),
     "unknown top key": (top(unit="mm"), "capture.json: unit", "unknown"),
     "unknown view key": (view(1, masks="a.png"), "capture.json: views[1].masks", "unknown"),
     "image not named": (drop(2, "image"), "capture.json: views[2].image", "missing"),
-    "image no string": (view(2, image=7), "capture.json: views[2].image", "path"),
     "image missing": (lambda f: (f / "images/001.png").unlink(), "images/001.png", "no such image file"),
     "image unreadable": (lambda f: (f / "images/001.png").write_bytes(b"?"), "images/001.png", "not a readable image"),
-    "image cut off": (
-        lambda f: (f / "images/001.png").write_bytes((f / "images/001.png").read_bytes()[:200]),
-        "images/001.png",
-        "not a readable image",
-    ),
     "image a folder": (view(0, image="images"), "images", "is a folder"),
     "image sizes differ": (
         lambda f: (png("images/001.png", (9, 9, 3))(f), png("masks/001.png", (9, 9))(f)),
         "images/001.png: size",
         "9 x 9",
     ),
-    "mask missing": (lambda f: (f / "masks/002.png").unlink(), "masks/002.png", "no such image file"),
     "mask size": (png("masks/001.png", (9, 9)), "masks/001.png: size", "9 x 9"),
     "mask of 0 and 1": (png("masks/001.png", (HEIGHT, WIDTH), 1 / 255), "masks/001.png: values", "255"),
     "mask for some": (drop(1, "mask"), "capture.json: views[1].mask", "all or none"),
     "K shape": (view(1, K=[[1, 0], [0, 1]]), "capture.json: views[1].K", "(3, 3)"),
-    "K ragged": (view(1, K=[[1, 0, 0], [0, 1]]), "capture.json: views[1].K", "3 x 3 numbers"),
-    "K null": (view(1, K=None), "capture.json: views[1].K", "3 x 3 numbers"),
     "K not finite": (view(1, K=NOT_FINITE), "capture.json: views[1].K", "finite"),
     "K transposed": (view(1, K=[[9, 0, 0], [0, 9, 0], [5, 5, 1]]), "capture.json: views[1]: K", "fx"),
-    "K negative": (view(1, K=[[-9, 0, 5], [0, 9, 5], [0, 0, 1]]), "capture.json: views[1]: K", "positive"),
     "camera 3 x 4": (view(1, cam_from_world=MIRRORED[:3]), "capture.json: views[1].cam_from_world", "(4, 4)"),
-    "camera singular": (view(1, cam_from_world=SINGULAR), "capture.json: views[1]: cam_from_world", "singular"),
     "camera mirrored": (view(1, cam_from_world=MIRRORED), "capture.json: views[1]: cam_from_world", "mirrored"),
     "frame too high": (view(1, frame=FRAMES), "capture.json: views[1].frame", "0 to 1"),
-    "frame negative": (view(1, frame=-1), "capture.json: views[1].frame", "0 to 1"),
     "frame a float": (view(1, frame=0.5), "capture.json: views[1].frame", "integer"),
-    "frame true": (view(1, frame=True), "capture.json: views[1].frame", "integer"),
     "frame left out": (drop(1, "frame"), "capture.json: views[1].frame", "2 poses"),
     "no body.npz": (lambda f: (f / "body.npz").unlink(), "body.npz", "no such file"),
     "broken body.npz": (lambda f: (f / "body.npz").write_bytes(b"PK\3\4 no"), "body.npz", "npz"),
-    "body.npz an npy": (
-        lambda f: (np.save(f / "a.npy", np.zeros(3)), shutil.move(f / "a.npy", f / "body.npz")),
-        "body.npz",
-        "npz",
-    ),
     "unknown parameter": (parameters(scale=1.0), "body.npz: scale", "unknown"),
     "no rotations": (parameters(rotations=None), "body.npz: rotations", "missing"),
     "pickled": (parameters(betas=np.array([None])), "body.npz: betas", "pickled"),
     "body a number": (parameters(body=np.asarray(3)), "body.npz: body", "makehuman"),
     "rotations shape": (parameters(rotations=np.zeros((FRAMES, JOINTS * 3))), "body.npz: rotations", "(frames, 5, 3)"),
-    "joints": (parameters(rotations=np.zeros((FRAMES, 24, 3))), "body.npz: rotations", "(frames, 5, 3)"),
-    "no poses": (parameters(rotations=np.zeros((0, JOINTS, 3))), "body.npz: rotations", "(frames, 5, 3)"),
     "pose NaN": (parameters(rotations=with_nan((FRAMES, JOINTS, 3), (1, 2, 0))), "body.npz: rotations", "[1, 2, 0]"),
-    "translation NaN": (parameters(translations=with_nan((FRAMES, 3), (0, 1))), "body.npz: translations", "finite"),
     "translation count": (parameters(translations=np.zeros((5, 3))), "body.npz: translations", "(2, 3)"),
     "betas too long": (parameters(betas=np.ones(4)), "body.npz: betas", "has 3 such directions"),
     "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "a list of numbers, got shape (1, 3)"),
-    "betas words": (parameters(betas=np.array(["a"])), "body.npz: betas", "numbers"),
-    "displacement count": (parameters(displacement=np.zeros((5, 3))), "body.npz: displacement", "(4, 3)"),
     "displacement NaN": (parameters(displacement=with_nan((4, 3), (2, 1))), "body.npz: displacement", "[2, 1]"),
     "displacement in millimetres": (
         parameters(displacement=np.full((4, 3), -10.0)),
@@ -322,19 +296,14 @@ def test_no_folder_and_no_model_file(folder, tmp_path):
 BAD_ARRAYS = {
     "uint8 range": (dict(images=np.full((VIEWS, HEIGHT, WIDTH, 3), 200)), "images: expected values in [0, 1]"),
     "channels": (dict(images=np.zeros((VIEWS, HEIGHT, WIDTH))), "images: expected shape"),
-    "none": (dict(images=np.zeros((0, HEIGHT, WIDTH, 3))), "images: expected shape"),
     "mask shape": (dict(masks=np.zeros((VIEWS, WIDTH, HEIGHT))), "masks: expected shape"),
-    "mask range": (dict(masks=np.full((VIEWS, HEIGHT, WIDTH), 255)), "masks: expected values"),
     "K": (dict(K=np.zeros((VIEWS, 3, 3))), "view 0: K"),
-    "K count": (dict(K=np.zeros((VIEWS + 1, 3, 3))), "K: expected shape"),
-    "cameras": (dict(cam_from_world=np.zeros((VIEWS, 3, 4))), "cam_from_world: expected shape"),
     "frames count": (dict(frames=[0]), "frames: expected shape"),
     "frames range": (dict(frames=[0, 1, 2]), "frames[2]: expected 0 to 1"),
     "frames kind": (dict(frames=[0.0, 1.0, 0.0]), "frames[0]: expected an integer"),
     "frames missing": (dict(frames=None), "frames: expected a frame for each view"),
     "names": (dict(names=["a", "a", "b"]), "names: expected 3 different names"),
     "name with slash": (dict(names=["a", "../b", "c"]), "names: expected letters"),
-    "background": (dict(background="black"), "background: expected one of"),
     "displacement": (dict(displacement=np.zeros((3, 4))), "displacement: expected shape (4, 3)"),
 }
 
@@ -419,11 +388,11 @@ def bad_captures():
     }
 
 
-@pytest.mark.parametrize("field", list(bad_captures()))
-def test_bad_capture_writes_nothing(tmp_path, field):
-    with pytest.raises(CaptureError) as caught:
-        save_capture(tmp_path / "sub" / "me", bad_captures()[field])
-    assert str(caught.value).startswith(f"capture: {field}")
+def test_bad_captures_write_nothing(tmp_path):
+    for field, bad in bad_captures().items():
+        with pytest.raises(CaptureError) as caught:
+            save_capture(tmp_path / "sub" / "me", bad)
+        assert str(caught.value).startswith(f"capture: {field}")
     assert list(tmp_path.iterdir()) == []
 
 

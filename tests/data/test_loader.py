@@ -333,7 +333,7 @@ def test_the_window_rule_is_the_release_s():
     assert distances == set(range(25, 60))
 
 
-@pytest.mark.parametrize("count", [8, 9, 12, 24, 120])
+@pytest.mark.parametrize("count", [8, 12, 120])
 def test_the_window_rule_scales_with_the_number_of_views(count):
     for seed in range(200):
         inputs, targets = draw_views(np.random.default_rng(seed), fake_subject(count, 1), 4, WINDOW)
@@ -341,10 +341,3 @@ def test_the_window_rule_scales_with_the_number_of_views(count):
         assert max(7, round(25 * count / 60)) <= inputs[1] - inputs[0] <= max(7, round(59 * count / 60))
     with pytest.raises(ValueError, match="7 views, but inputs and targets need 8"):
         draw_views(np.random.default_rng(0), fake_subject(7, 1), 4, WINDOW)
-
-
-def test_the_window_rule_is_a_function_of_seed_and_step(folder):
-    sampling = ViewSampling(input_counts=(2,), target_count=2, rule="window")
-    source = lambda: loader_of(CaptureCache(find_captures(folder), BODY), sampling, SIZE, SIZE)
-    assert all(same(source().source.example(0, i, 2), source().source.example(0, i, 2)) for i in range(5))
-    assert not same(source().source.example(0, 0, 2), source().source.example(0, 3, 2))

@@ -1,8 +1,0 @@
-import pytest
-
-from humangs_jax.detection.people import Networks
-
-
-@pytest.fixture(scope="session")
-def networks():
-    return Networks()
