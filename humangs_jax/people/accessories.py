@@ -13,21 +13,7 @@ from humangs_jax.people import hair, surfaces, tailoring
 from humangs_jax.people.anatomy import FLOOR, HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE, Anatomy, Vector
 from humangs_jax.people.fabrics import Fabric, Material, Spots, band, color, mix
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.surfaces import (
-    Boundaries,
-    Faces,
-    Field,
-    Points,
-    Surface,
-    blurred,
-    circle,
-    grid_faces,
-    hanging,
-    join,
-    ripples,
-    sweep,
-    unit,
-)
+from humangs_jax.people.surfaces import Faces, Field, Points, Surface, circle, grid_faces, join, ripples, sweep, unit
 
 RING, COLUMNS = 40, 32
 """Points of a ring around neck or head; of a ring of a shoe."""
@@ -59,32 +45,31 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
 
 
 def _painted(dye: Vector, sheen: float) -> Material:
-    """A material of one color."""
     return Material(lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen)
 
 
 def _panelled(fabric: Fabric, s: Spots) -> Points:
-    """Six panels of a cap with a button on top."""
     angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
     seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
     return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
 
 
 def _ribboned(fabric: Fabric, s: Spots) -> Points:
-    """A hat with a ribbon above its brim."""
     above = hair.above_line(s.template, hair.CAP_LINE)
     on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
     return mix(fabric.colors(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
 
 
-def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
-    """(RING, 3) rest points around the neck at a lift above the crew neckline, from front over left, and outward directions."""
+Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
+"""`RING` rest points from front over left, and outward directions."""
+
+
+def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
+    """Around the neck at a lift above the crew neckline."""
     return _ring(anatomy, np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02, -0.005)
 
 
-def _ring(
-    anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float
-) -> tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]:
+def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> Ring:
     """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed line."""
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
@@ -154,14 +139,13 @@ def _tail(
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
-    boundary = blurred(hanging(anatomy.trunk, 0.2), 2)
+    boundary = surfaces.blurred(surfaces.hanging(anatomy.trunk, 0.2), 2)
     z = boundary.radius(y, np.arctan2(x, np.full(rows, 0.12))) + ease + 0.016
     z = np.maximum(z, start[2] + 0.7 * thickness + np.linspace(0, 0.01, rows))
-    path = np.stack([x, y, z], -1)
-    widths = np.stack([np.full(rows, 0.045 + 0.3 * thickness), np.full(rows, 0.010)], -1)
+    widths = np.tile([0.045 + 0.3 * thickness, 0.010], (rows, 1))
     widths[0] *= 0.5
     widths[-1, 1] = 0.002
-    return _followed(anatomy, path, SIDEWAYS, widths, 10, closed=False)
+    return _followed(anatomy, np.stack([x, y, z], -1), SIDEWAYS, widths, 10, closed=False)
 
 
 def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points) -> Surface:
@@ -281,8 +265,9 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
     thin, thick = (surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
     shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
-    pairs = (thin.centers, thick.centers), (thin.radii, blurred(thick, 2).radii)
-    shape = hanging(Boundaries(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6)  # the sole is as wide as what is above it
+    pairs = (thin.centers, thick.centers), (thin.radii, surfaces.blurred(thick, 2).radii)
+    shape = surfaces.Boundaries(levels, *(a + (b - a) * shin for a, b in pairs))
+    shape = surfaces.hanging(shape, 0.6)  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]
     rings = []

@@ -6,13 +6,12 @@ metres. A vertex keeps them for every shape of the person, so one number fits al
 """
 
 import dataclasses
-import functools
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.surfaces import Boundaries, Faces, Field, Points, Surface, blurred, boundaries, vertex_normals
+from humangs_jax.people.surfaces import Boundaries, Faces, Points, Surface, blurred, boundaries, vertex_normals
 
 Rotations = Float[np.ndarray, "j 3"]
 """Rotation vectors of all joints, relative to their parents."""
@@ -89,13 +88,10 @@ def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
 
 def joint_positions(build: Build, rotations: Rotations) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
     """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
-    local = rotation_matrix(rotations)
-    world, positions = np.empty_like(local), np.empty_like(build.joints, dtype=np.float64)
+    world, positions = rotation_matrix(rotations), np.array(build.joints, np.float64)
     for j, parent in enumerate(build.parents):
-        if parent < 0:
-            world[j], positions[j] = local[j], build.joints[j]
-        else:
-            world[j] = world[parent] @ local[j]
+        if parent >= 0:  # parents come before their children
+            world[j] = world[parent] @ world[j]
             positions[j] = positions[parent] + world[parent] @ (build.joints[j] - build.joints[parent])
     return world, positions
 
@@ -199,8 +195,8 @@ def _frame(direction: Vector, across: Vector) -> Matrix:
 # The body under clothes -----------------------------------------------------------------------------------------------
 
 
-BODY_NAME, BODY_VERTICES = "makehuman", 13380
-"""The body that the cuts below were measured on."""
+BODY = ("makehuman", 13380)
+"""The body that the cuts below were measured on: its name and number of vertices."""
 WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
 ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
@@ -278,19 +274,12 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     return result
 
 
-@functools.lru_cache(maxsize=1)
-def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
-    template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
-    # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
-    arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
-    return template, cloth_coordinates(template), arm, leg_membership(template)
-
-
 def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple) -> Anatomy:
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
-    template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
-    vertices = np.asarray(vertices, np.float32)
-    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
+    vertices, leg = np.asarray(vertices, np.float32), leg_membership(template)
+    # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
+    arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
+    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth_coordinates(template)}
     skin = Surface(vertices, faces, weights, attributes)
     levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)

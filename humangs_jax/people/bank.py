@@ -3,7 +3,7 @@
 Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the texture stay clean at seams.
 Folds that are painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
 
-A scan is such a mesh in a folder, like a scanner's: scan.obj with material.mtl and material_0.png, scan.glb, and scan.json
+A scan is such a mesh, lit, in a folder, like a scanner's: scan.obj with material.mtl and material_0.png, scan.glb, and scan.json
 with seed, shape and pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.
 
 A bank is made on the host once, all of one shape, and used by `on_the_fly_example`. It holds people of ONE range of seeds (see
@@ -41,7 +41,6 @@ from humangs_jax.people.subject import (
     light_points,
     make_subject,
     paint,
-    pose_subject,
     split_of,
     spots_at,
 )
@@ -104,40 +103,35 @@ def strongest_joints(weights: Float[np.ndarray, "n j"], count: int) -> tuple[np.
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
 
 
-SCAN, TEXTURE, PARAMETERS = "scan", "material_0.png", "scan.json"
-"""Names in a scan's folder: of the meshes (without ending), the texture of the OBJ, and what is known of the person."""
+SCAN, PARAMETERS = "scan", "scan.json"
+"""Names in a scan's folder: of the meshes (without ending), and what is known of the person."""
 
 
-def export_scan(
-    subject: SyntheticSubject,
-    folder: str | Path,
-    pose: BodyPose | None = None,
-    *,
-    lit: bool = False,
-    texture_size: int = 2048,
-    formats: Sequence[str] = ("obj", "glb"),
-) -> Path:
-    """Write a subject as a textured mesh, in a pose or (None) in the T-pose at rest; returns the folder.
+def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
+    """Write a posed subject as a mesh whose texture carries its light, whole or not at all. An existing folder is replaced."""
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-    lit: the texture carries the subject's light in that pose; otherwise it is albedo. Written whole or not at all; an
-    existing folder is replaced. Raises: ValueError if a format is neither "obj" nor "glb".
-    """
-    if unknown := set(formats) - {"obj", "glb"}:
-        raise ValueError(f"scans are written as obj or glb, not as {sorted(unknown)}")
-    pose = BodyPose(jnp.zeros((len(subject.build.joints), 3)), jnp.zeros(3)) if pose is None else pose
-    posed = pose_subject(subject, *(np.asarray(x, np.float32) for x in (pose.rotations, pose.translation)))
-    baked = bake_subject(subject, texture_size)
-    texture = lit_texture(posed, baked) if lit else baked.albedo
+    subject, baked = posed.subject, bake_subject(posed.subject, texture_size)
+    image = Image.fromarray(lit_texture(posed, baked))
+    materials = {
+        "obj": SimpleMaterial(image=image, diffuse=[255, 255, 255, 255]),
+        "glb": PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0),
+    }
     known = {"betas": subject.betas, "rotations": posed.rotations, "translation": posed.translation}
-    known = {"seed": subject.seed, "lit": lit} | {name: value.tolist() for name, value in known.items()}
+    known = {"seed": subject.seed, "lit": True} | {name: value.tolist() for name, value in known.items()}
 
     def write(temporary: Path):
         temporary.mkdir()
-        _write_mesh(temporary, posed.vertices[baked.atlas.vertices], baked, texture, formats)
+        for kind, material in materials.items():
+            visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
+            mesh = trimesh.Trimesh(posed.vertices[baked.atlas.vertices], baked.atlas.faces, visual=visual, process=False)
+            mesh.export(temporary / f"{SCAN}.{kind}")
         write_json(temporary / PARAMETERS, known, indent=None)
 
     replace_folder(folder, write, mark=PARAMETERS)
-    return Path(folder)
 
 
 def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
@@ -149,27 +143,6 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
     colors = np.zeros((*ids.shape, 3), np.float32)
     colors[known] = light_points(posed, ids[known], weights[known], albedo, slopes)
     return np.round(255 * fill_gaps(colors, known)).astype(np.uint8)
-
-
-def _write_mesh(
-    folder: Path,
-    vertices: Float[np.ndarray, "u 3"],
-    baked: BakedSubject,
-    texture: UInt8[np.ndarray, "t t 3"],
-    formats: Sequence[str],
-) -> None:
-    import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial, SimpleMaterial
-
-    image = Image.fromarray(texture)
-    simple = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
-    physical = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
-    for kind, material in (("obj", simple), ("glb", physical)):
-        if kind in formats:
-            visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
-            trimesh.Trimesh(vertices, baked.atlas.faces, visual=visual, process=False).export(folder / f"{SCAN}.{kind}")
 
 
 # Banks ----------------------------------------------------------------------------------------------------------------
@@ -372,17 +345,14 @@ def to_silhouettes(subject: SyntheticSubject, body: BodyModel, rotations: Float[
     return displacement(body, Capture(images, masks, cameras, frames, body, subject.betas, poses, names)).astype(np.float16)
 
 
-_BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")
-
-
 def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
     vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
     faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
 
     def padded(name, array):
-        if name in _BY_FACE:
+        if name in ("faces", "uvs", "face_pieces"):
             return np.pad(array, [(0, faces - len(array))] + [(0, 0)] * (array.ndim - 1))
-        if name in _BY_VERTEX:
+        if name in ("vertices", "normals", "joint_ids", "joint_weights"):
             return np.concatenate([array, np.repeat(array[:1], vertices - len(array), axis=0)])
         return array
 

@@ -238,11 +238,8 @@ def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) 
         x, y, z = s.template[:, 0], s.template[:, 1], s.template[:, 2] - 0.02
         angle, radial = np.arctan2(x, z), np.sqrt(x * x + z * z)
         if curls:
-            fine, coarse, shine = (
-                lattice(s.template / 0.006, seed),
-                lattice(s.template / 0.02, seed + 1),
-                np.zeros(1, np.float32),
-            )
+            fine, coarse = lattice(s.template / 0.006, seed), lattice(s.template / 0.02, seed + 1)
+            shine = np.zeros(1, np.float32)
         else:
             strand, run = angle / 0.04, (y - 0.6 * radial) / 0.09
             fine = lattice(np.stack([strand + 0.8 * np.sin(run), run, radial / 0.05], -1), seed)

@@ -69,18 +69,9 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
     beard = drawn(rng, BEARDS) if male and years > 17 else "none"
     long = 0.35 if rng.random() < 0.8 else 1.0
-    return Haircut(
-        cut=cut,
-        fringe=drawn(rng, FRINGES),
-        side=float(rng.choice([-1, 1])),
-        thickness=float(thickness),
-        bottom=bottom,
-        wave=float(wave),
-        receding=receding,
-        beard=beard,
-        beard_length=rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016),
-        grain=rng.uniform(0.5, 0.95),
-    )
+    fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
+    beard_length, grain = rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016), rng.uniform(0.5, 0.95)
+    return Haircut(cut, fringe, side, float(thickness), bottom, float(wave), receding, beard, beard_length, grain)
 
 
 SKULL = np.asarray([0.0, 0.345, 0.02])

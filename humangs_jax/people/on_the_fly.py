@@ -13,7 +13,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
-from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +21,7 @@ from jax import lax
 
 from humangs_jax.body.model import joint_transforms
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
-from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
+from humangs_jax.core.configuration import Few, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -33,13 +32,15 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import surroundings
 from humangs_jax.people.anatomy import MIRROR
 from humangs_jax.people.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
-from humangs_jax.people.subject import SPLITS, subject_key
+from humangs_jax.people.subject import SPLITS, SUPERSAMPLING, subject_key
 from humangs_jax.people.surroundings import pick
 from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
-MIXING = 0.5
-"""Largest share of the way to the nearest pose; the other half of the way is reached from that pose."""
+POSES, MIXING = 2, 0.5
+"""Of an example; largest share of the way to the nearest pose: the other half of the way is reached from that pose."""
+DYED_SHARE, CLOSE_SHARE = 0.7, 0.2
+"""Of examples whose clothes get other colors; of close cameras among the targets."""
 DISPLACED, COUNTED = 1, 2
 """They make the keys that decide whether the body is displaced and how many views there are from that of an example."""
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
@@ -60,24 +61,16 @@ class OnTheFlyConfig:
     """Pixels a side."""
     target_size: Side = 256
     """Pixels a side."""
-    poses: Few = 2
-    """Per example; targets show any of them."""
     mixed_pose_share: Share = 0.3
-    """Of examples whose inputs show any of the poses too, each; otherwise all show the first."""
+    """Of examples whose inputs show any of the `POSES` too, each, as targets do; otherwise all show the first."""
     jitter: Spread = 0.7
     """See `surroundings.azimuths_from`."""
     scattered_share: Share = 0.2
     """See `surroundings.azimuths_from`."""
-    close_share: Share = 0.2
-    """Of close cameras among the targets."""
     mirrored_share: Share = 0.5
-    """Of examples."""
-    dyed_share: Share = 0.7
     """Of examples."""
     displaced_share: Share = 0.0
     """Of examples: their body is displaced to the silhouettes of the clothes, and they are not mirrored."""
-    supersampling: Annotated[int, Range(1, 16)] = 2
-    """Samples a side of each pixel."""
     depths: bool = False
     """Also of every view."""
     views_at_once: Few = knob(1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md")
@@ -116,7 +109,7 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
     if config.displaced_share and not bank.displacements.shape[1]:
         raise ValueError("displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)")
     numbers = _draw_numbers(bank, key, config)
-    scene = scene_from(numbers, bank, config)
+    scene = scene_from(numbers, bank)
     count = None
     if config.view_counts:
         number = jax.random.uniform(jax.random.fold_in(key, COUNTED))
@@ -143,7 +136,7 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
 
 def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[str, Float[Array, "..."]]:
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
-    shapes = {"person": (), "poses": (config.poses, 2), "lights": (surroundings.LIGHT_NUMBERS,), "dyed": ()}
+    shapes = {"person": (), "poses": (POSES, 2), "lights": (surroundings.LIGHT_NUMBERS,), "dyed": ()}
     shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
     for name, count in (("input", config.input_views), ("target", config.target_views)):
         shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
@@ -153,7 +146,7 @@ def _draw_numbers(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> dict[st
     return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
 
-def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConfig) -> Scene:
+def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
     """Who, in which poses, colors and light; numbers in [0, 1) by name."""
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
@@ -161,7 +154,7 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConf
     poses, nearest = bank.rotations[person, which], bank.rotations[person, bank.nearest[person, which]]
     rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
     dyes = surroundings.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
-    dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
+    dyes = jnp.where(numbers["dyed"] < DYED_SHARE, dyes, jnp.eye(3))
     lights = surroundings.lights_from(numbers["lights"])
 
     def pose(rotations):
@@ -198,10 +191,10 @@ def _plans(numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, coun
     count: of the inputs; after them the last one is repeated. None: all.
     """
     azimuths = surroundings.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share, count)
-    own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
+    own, other = (pick(numbers[name], POSES) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
     anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
-    close = jnp.full(config.target_views, config.close_share)
+    close = jnp.full(config.target_views, CLOSE_SHARE)
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
     if count is not None:
         inputs = jax.tree.map(lambda x: x[jnp.minimum(jnp.arange(config.input_views), count - 1)], inputs)
@@ -235,20 +228,20 @@ def draw_view(
     """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and (h, w) mean z of what
     is covered, metres, 0 in the background.
     """
-    s = config.supersampling
-    fine = camera.resized(camera.width * s, camera.height * s)
+    fine = camera.resized(camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
     behind = surroundings.seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
-    z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera, s)[..., 0]
-    coverage = _box_average(covered, camera, s)[..., 0]
-    return _box_average(colors, camera, s), coverage, safe_divide(z, coverage)
+    z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera)[..., 0]
+    coverage = _box_average(covered, camera)[..., 0]
+    return _box_average(colors, camera), coverage, safe_divide(z, coverage)
 
 
-def _box_average(samples: Float[Array, "samples c"], camera: Camera, s: int) -> Float[Array, "h w c"]:
-    """Means (h, w, c) of s x s samples (h s w s, c); added one by one: XLA's CPU backend reduces two axes slowly."""
+def _box_average(samples: Float[Array, "samples c"], camera: Camera) -> Float[Array, "h w c"]:
+    """Means of s x s samples of each pixel; added one by one: XLA's CPU backend reduces two axes slowly."""
+    s = SUPERSAMPLING
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
     return jnp.asarray(sum(samples[:, i, :, j] for i in range(s) for j in range(s))) / (s * s)
 
@@ -397,8 +390,5 @@ def on_the_fly_source(
 
     input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
     """
-
-    def make(key: Key, input_count: int) -> Example:
-        return jitted_example(bank, key, config=dataclasses.replace(config, input_views=input_count))
-
+    make = lambda key, count: jitted_example(bank, key, config=dataclasses.replace(config, input_views=count))
     return GeneratedSource(make=make, split=bank.split, input_counts=input_counts, on_host=on_host)

@@ -19,17 +19,7 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import complexion, hair, surroundings, wardrobe
-from humangs_jax.people.anatomy import (
-    BODY_NAME,
-    BODY_VERTICES,
-    LEFT_KNEE,
-    Anatomy,
-    Build,
-    Rotations,
-    Vector,
-    joint_positions,
-    measure,
-)
+from humangs_jax.people.anatomy import BODY, LEFT_KNEE, Anatomy, Build, Rotations, Vector, joint_positions, measure
 from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material, Spots
 from humangs_jax.people.hair import Haircut, sample_haircut
@@ -70,16 +60,14 @@ def split_of(seed: int) -> str:
     for name, seeds in SPLITS.items():
         if seed in seeds:
             return name
-    ranges = ", ".join(f"{name} {seeds.start}..{seeds.stop - 1}" for name, seeds in SPLITS.items())
-    raise ValueError(f"seed {seed} lies in no range: {ranges}")
+    raise ValueError(f"seed {seed} lies in no range: {SPLITS}")
 
 
 def seeds_of(split: str, first: int, count: int) -> range:
     """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
-        asked = f"subjects {first}..{first + count - 1}"
-        raise ValueError(f"{asked} reach beyond the split '{split}', which has {len(people)}")
+        raise ValueError(f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}")
     return people[first : first + count]
 
 
@@ -194,8 +182,8 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
 
     Raises: ValueError if the body is not the package's own: cuts and paint are given in its coordinates.
     """
-    if body.name != BODY_NAME or body.template.shape[0] != BODY_VERTICES:
-        raise ValueError(f"synthetic people need the shipped body '{BODY_NAME}', got '{body.name}'")
+    if (body.name, len(body.template)) != BODY:
+        raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
     person = describe(seed, body) if person is None else person
     rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights, *_ = _host_arrays(body)
@@ -212,19 +200,11 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
     skin_material = complexion.skin_material(np.random.default_rng([seed, 22]), person.complexion, person.haircut)
     eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
     pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
-    surface = join([piece.surface for piece in pieces])
-    cover = skin.attributes["cover"]
-    return SyntheticSubject(
-        seed=seed,
-        betas=person.betas,
-        surface=surface,
-        face_materials=np.concatenate([np.full(len(p.surface.faces), i, np.int32) for i, p in enumerate(pieces)]),
-        materials=tuple(piece.material for piece in pieces),
-        lights=person.lights,
-        build=_build(anatomy, surface),
-        cover=np.pad(cover, (0, len(surface.vertices) - len(cover)), constant_values=-1.0),
-        person=person,
-    )
+    surface, materials = join([piece.surface for piece in pieces]), tuple(piece.material for piece in pieces)
+    cover = np.pad(skin.attributes["cover"], (0, len(surface.vertices) - len(skin.vertices)), constant_values=-1.0)
+    ids = np.repeat(np.arange(len(pieces), dtype=np.int32), [len(piece.surface.faces) for piece in pieces])
+    build = _build(anatomy, surface)
+    return SyntheticSubject(seed, person.betas, surface, ids, materials, person.lights, build, cover, person)
 
 
 _HOST: dict[int, tuple] = {}
@@ -264,14 +244,8 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
     low = surface.vertices[(surface.vertices[:, 1] < -0.5) & (surface.vertices[:, 1] > -0.9)]
     spread = float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2  # wide skirts keep the hands away
     leg_line = float(np.abs(anatomy.joints[LEFT_KNEE, 0]))
-    return Build(
-        joints=anatomy.joints.astype(np.float64),
-        parents=anatomy.parents,
-        torso_radius=depth + 0.015,
-        thigh_radius=max(thigh + 0.02, spread - leg_line),
-        shin_radius=max(0.07, spread - leg_line - 0.02),
-        arm_radius=0.035,
-    )
+    radii = depth + 0.015, max(thigh + 0.02, spread - leg_line), max(0.07, spread - leg_line - 0.02), 0.035
+    return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
 
 
 # Posed and rendered ---------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jax.scipy.special import ndtri
 
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Matrix3, Scalar, Vector3
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar, Vector3
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
 from humangs_jax.people.anatomy import Vector
@@ -36,6 +36,8 @@ JITTER, CAMERA_NUMBERS = 0.3, 5
 UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
 Number = Float[Array, ""] | float
+Each = Float[Array | np.ndarray, "3 ..."]
+"""Of three lights or channels."""
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
@@ -58,7 +60,7 @@ def cameras_around(rng: np.random.Generator, vertices: Points, azimuths: Angles,
     points = np.pad(vertices - center, ((0, -len(vertices) % POINT_STEP), (0, 0)), mode="edge")
     near = _nearest_distances(jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations)))
     targets = np.broadcast_to(center, (len(azimuths), 3))
-    return _orbits(targets, np.maximum(distances, np.asarray(near)), azimuths, elevations, image_size)
+    return _orbits(image_size, targets, np.maximum(distances, np.asarray(near)), azimuths, elevations)
 
 
 def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:
@@ -74,26 +76,15 @@ def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, 
     for i in range(count):
         while np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min() < CLEARANCE:
             distances[i] += 0.05 * radius
-    return _orbits(targets, distances, azimuths, elevations, image_size)
+    return _orbits(image_size, targets, distances, azimuths, elevations)
 
 
-def _orbits(targets: Float[np.ndarray, "v 3"], distances: Angles, azimuths: Angles, elevations: Angles, size: int) -> Camera:
-    """A batch of cameras that each look at a target of their own."""
-    placed = (jnp.asarray(x, jnp.float32) for x in (targets, distances, azimuths, elevations))
-    return _placed(*placed, intrinsics_from_fov(VERTICAL_FOV, size, size), size)
-
-
-@functools.partial(jax.jit, static_argnums=5)
-def _placed(
-    targets: Float[Array, "v 3"],
-    distances: Float[Array, " v"],
-    azimuths: Float[Array, " v"],
-    elevations: Float[Array, " v"],
-    K: Matrix3,
-    size: int,
-) -> Camera:
-    one = lambda target, *rest: orbit(target, *(x[None] for x in rest), K, size, size)[0]
-    return jax.vmap(one)(targets, distances, azimuths, elevations)
+@functools.partial(jax.jit, static_argnums=0)
+def _orbits(size: int, targets: Float[Array, "v 3"], *spherical: Float[Array, " v"]) -> Camera:
+    """A batch of cameras that each look at a target of their own. spherical: distances, azimuths, elevations."""
+    K = intrinsics_from_fov(VERTICAL_FOV, size, size)
+    one = lambda target, *place: orbit(target, *(x[None] for x in place), K, size, size)[0]
+    return jax.vmap(one)(targets, *spherical)
 
 
 def camera_from(
@@ -256,21 +247,13 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
 
 
 def _lights(
-    numpy: ModuleType,
-    angles: Float[Array | np.ndarray, " k"],
-    elevations: Float[Array | np.ndarray, " k"],
-    power: Float[Array | np.ndarray, " k"],
-    tint: Float[Array | np.ndarray, "k 3"],
-    warmth: Float[Array, ""] | float,
-    sky: Float[Array | np.ndarray, "3"],
-    ground: Float[Array | np.ndarray, "3"],
-    gain: Float[Array | np.ndarray, "3"],
+    numpy: ModuleType, angles: Each, elevations: Each, power: Each, tint: Each, warmth: Number, *sky_ground_gain: Each
 ) -> Lights:
     """numpy: the module of the arrays' kind."""
     flat = numpy.cos(elevations)
     directions = numpy.stack([flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1)
     strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
-    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain)))
+    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, *sky_ground_gain)))
 
 
 def shaded_vertices(

@@ -133,8 +133,7 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
     else:
         shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
-        moments = zip(np.asarray(motion.rotations)[shown], np.asarray(motion.translations)[shown], strict=True)
-        posed = [pose_subject(subject, *moment) for moment in moments]
+        posed = [pose_subject(subject, np.asarray(motion.rotations[i]), np.asarray(motion.translations[i])) for i in shown]
     others = [posed[0], *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses))]
     size = layout.image_size
     views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
@@ -148,8 +147,7 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
         if motion is not None:
             save_motion(temporary / "motion.npz", motion)
         if layout.scan_texture:
-            pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
-            export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
+            export_scan(posed[0], temporary / "scan", layout.scan_texture)
 
     replace_folder(folder, write, mark=CAPTURE)
 
@@ -193,10 +191,8 @@ def write_set(
                     listed = time.monotonic()
     finally:
         write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
-    if failed:
-        seed, error = next(iter(failed.items()))
-        found = f"{len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
-        raise ValueError(f"{out}: {found}")
+    for seed, error in failed.items():
+        raise ValueError(f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}")
     return list(folders.values())
 
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose
 from humangs_jax.people import bank, subject, surroundings, writer
 from humangs_jax.people.subject import DEMO
 from humangs_jax.rendering.mesh import atlas, rasterizer
 from humangs_jax.rendering.mesh.rasterizer import sample_texture
 
-SIZE = 512
+SIZE = 256
 LEAST_DENSITY = 0.4
 """Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction; measured 0.5 for the worst percent."""
 SKINNING = 1.5e-3
@@ -46,12 +45,13 @@ def flat_areas(uvs, faces):
     return 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
 
 
-@pytest.mark.slow
-def test_charts_do_not_overlap_and_keep_their_winding(baked, shown):
+def test_charts_do_not_overlap_and_keep_their_winding(person, baked, shown):
+    np.testing.assert_array_equal(baked.atlas.vertices[baked.atlas.faces], person.surface.faces)
+    assert baked.atlas.uvs.min() >= 0 and baked.atlas.uvs.max() <= 1
     areas = flat_areas(baked.atlas.uvs, baked.atlas.faces) * SIZE**2
     assert areas.min() > -1e-3
     covered = np.count_nonzero(shown[0] >= 0)
-    assert abs(areas.sum() / covered - 1) < 0.005  # each covered texel belongs to one face
+    assert abs(areas.sum() / covered - 1) < 0.01  # each covered texel belongs to one face; rims are rounded
     assert covered > 0.4 * SIZE**2
 
 
@@ -76,12 +76,7 @@ def test_texels_are_spread_evenly(person, baked):
     assert worst > LEAST_DENSITY
     assert 0.75 < np.median(density) < 1.01
     assert density.max() < bank.FACE_DENSITY**2 * 1.01
-    assert baked.atlas.texel < 0.007
-
-
-def test_corners_of_the_atlas_are_those_of_the_mesh(person, baked):
-    np.testing.assert_array_equal(baked.atlas.vertices[baked.atlas.faces], person.surface.faces)
-    assert baked.atlas.uvs.min() >= 0 and baked.atlas.uvs.max() <= 1
+    assert baked.atlas.texel < 0.014
 
 
 def test_the_texture_says_what_the_materials_say(person, baked):
@@ -122,36 +117,28 @@ def test_a_few_joints_move_the_mesh_as_all_of_them(person):
     assert moved(2) > moved(bank.JOINTS_PER_VERTEX)
 
 
-def read_mesh(path) -> Any:
+@pytest.mark.slow
+def test_scans_are_read_back_as_they_were(person, tmp_path):
     import trimesh
 
-    return trimesh.load(path, process=False, force="mesh")
-
-
-@pytest.mark.slow
-def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
-    posed = writer.sample_pose(person, 0)
-    pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
-    folder = bank.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
-    assert not list(tmp_path.glob(".*"))
-    known = json.loads((folder / bank.PARAMETERS).read_text())
+    posed, baked = writer.sample_pose(person, 0), bank.bake_subject(person, 512)
+    bank.export_scan(posed, tmp_path / "scan", 512)
+    known = json.loads((tmp_path / "scan" / bank.PARAMETERS).read_text())
     assert known["seed"] == person.seed and known["lit"]
     np.testing.assert_allclose(known["rotations"], posed.rotations)
-    textures = []
-    mesh = None
+    expected = bank.lit_texture(posed, baked)
     for name in ("scan.obj", "scan.glb"):
-        mesh = read_mesh(folder / name)
+        mesh: Any = trimesh.load(tmp_path / "scan" / name, process=False, force="mesh")
         np.testing.assert_array_equal(mesh.faces, baked.atlas.faces)
         np.testing.assert_allclose(mesh.vertices, posed.vertices[baked.atlas.vertices], atol=1e-6)
         np.testing.assert_allclose(mesh.visual.uv, baked.atlas.uvs, atol=1e-6)
         material = mesh.visual.material
         texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[..., :3]
-        np.testing.assert_array_equal(texture, bank.lit_texture(posed, baked))
-        textures.append(texture)
+        np.testing.assert_array_equal(texture, expected)
     camera = surroundings.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
     direct, mask = subject.render_view(posed, camera)
-    faces, uvs = jnp.asarray(mesh.faces, jnp.int32), jnp.asarray(mesh.visual.uv, jnp.float32)
-    vertices, texture = jnp.asarray(mesh.vertices, jnp.float32), jnp.asarray(textures[0] / 255, jnp.float32)
+    faces, uvs = jnp.asarray(baked.atlas.faces), jnp.asarray(baked.atlas.uvs)
+    vertices, texture = jnp.asarray(posed.vertices[baked.atlas.vertices]), jnp.asarray(expected / 255, jnp.float32)
     seen = rasterizer.rasterize_mesh(vertices, faces, camera.resized(2 * camera.width, 2 * camera.height))
     covered = (seen.face_ids >= 0)[..., None]
     uv = rasterizer.interpolate_attributes(seen, faces, uvs, jnp.zeros(2))
@@ -161,25 +148,17 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     assert -10 * np.log10(np.mean((np.asarray(again) - direct) ** 2)) > SCAN_PSNR
 
 
-def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
-    folder = bank.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
-    assert sorted(file.name for file in folder.iterdir()) == ["scan.glb", "scan.json"]
-    mesh = read_mesh(folder / "scan.glb")
-    np.testing.assert_allclose(mesh.vertices, person.surface.vertices[baked.atlas.vertices], atol=1e-6)
-    np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture)[..., :3], baked.albedo)
-
-
-def test_a_scan_is_written_whole_or_not_at_all(person, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="obj or glb"):
-        bank.export_scan(person, tmp_path / "scan", formats=("ply",))
-
-    def fail(*_):
+def test_a_scan_is_written_whole_or_not_at_all(person, baked, tmp_path, monkeypatch):
+    def fail(*_, **__):
         raise OSError("disk full")
 
     (tmp_path / "scan").mkdir()
     (tmp_path / "scan" / "scan.json").touch()
-    monkeypatch.setattr(bank, "_write_mesh", fail)
+    monkeypatch.setattr(bank, "write_json", fail)
+    monkeypatch.setattr(bank, "bake_subject", lambda *_: baked)
+    monkeypatch.setattr(bank, "lit_texture", lambda *_: baked.albedo)
     with pytest.raises(OSError, match="disk full"):
-        bank.export_scan(person, tmp_path / "scan", texture_size=SIZE)
-    assert [path.name for path in tmp_path.iterdir()] == ["scan"]
-    assert (tmp_path / "scan" / "scan.json").exists()
+        bank.export_scan(
+            subject.pose_subject(person, np.zeros((55, 3), np.float32), np.zeros(3, np.float32)), tmp_path / "scan", 128
+        )
+    assert [path.name for path in tmp_path.rglob("*")] == ["scan", "scan.json"]

@@ -11,16 +11,12 @@ from hypothesis import strategies as st
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
-from humangs_jax.body.resolution import decimate
 from humangs_jax.people import anatomy as kin
 from humangs_jax.people.poses import STANCES, arm_clearance, pose_hand, sample_rotations, take_stance
-from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 CLOSE = 1e-4
 """Metres or radians after 10 chained float32 rotations against float64."""
 SEEDS = range(40)
-INSIDE = 0.012
-"""Share of the body's vertices inside another part, mean over poses: creases of armpits and groin are 0.7 % of them."""
 
 
 @functools.cache
@@ -46,12 +42,6 @@ def posed(body):
     rest = shape_body(body, jnp.zeros(0))
     pose = jax.jit(lambda rotations: pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices)
     return lambda rotations: np.asarray(pose(jnp.asarray(rotations, jnp.float32)))
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-5, 0.3, 2.0, 3.0, np.pi - 1e-9])
-def test_rotation_vectors_round_trip(angle):
-    vectors = angle * np.asarray([[1.0, 0, 0], [0, -0.6, 0.8], [0.48, 0.6, 0.64], [0, 0, -1.0]])
-    np.testing.assert_allclose(kin.rotation_vector(kin.rotation_matrix(vectors)), vectors, atol=1e-7)
 
 
 @given(st.lists(st.floats(-1.7, 1.7), min_size=6, max_size=6), st.floats(0, 1))
@@ -143,52 +133,9 @@ def test_hands_stay_clear_of_the_body(build, drawn):
     assert (clear < -0.01).mean() < 0.06
 
 
-def winding_numbers(points, vertices, faces):
-    """How often a mesh winds around each point: sum of the signed solid angles of its faces over 4 pi."""
-    dot = lambda x, y: jnp.sum(x * y, axis=-1)
-
-    def one(point):
-        a, b, c = (vertices[faces[:, i]] - point for i in range(3))
-        la, lb, lc = (jnp.linalg.norm(x, axis=-1) for x in (a, b, c))
-        below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
-        return jnp.sum(2 * jnp.arctan2(dot(a, jnp.cross(b, c)), below)) / (4 * jnp.pi)
-
-    return jax.lax.map(one, points, batch_size=64)
-
-
-@jax.jit
-def inside_itself(body, rotations):
-    """Which vertices lie inside of another part: 2 mm off along their normal. Meshes are not quite closed (mouth, eyes)."""
-    vertices = pose_body(body, shape_body(body, jnp.zeros(0)), BodyPose(jnp.asarray(rotations), jnp.zeros(3))).vertices
-    return winding_numbers(vertices + 2e-3 * vertex_normals(vertices, body.faces), vertices, body.faces) > 0.6
-
-
-def test_winding_numbers_count_how_often_a_mesh_goes_around():
-    corners = np.asarray([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-    faces = np.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])  # a tetrahedron, seen from outside counter-clockwise
-    twice = jnp.asarray(np.concatenate([corners, 0.5 * corners])), jnp.asarray(np.concatenate([faces, faces + 4]))
-    points = jnp.asarray([[0.05, 0.05, 0.05], [0.3, 0.3, 0.3], [1.0, 1.0, 1.0], [-0.2, 0.1, 0.1]])
-    np.testing.assert_allclose(winding_numbers(points, *twice), [2, 1, 0, 0], atol=1e-5)
-
-
-@pytest.mark.slow
-def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
-    body = decimate(body, 1000)
-    at_rest = inside_itself(body, np.zeros((kin.JOINTS, 3), np.float32))
-    assert at_rest.mean() < 0.02  # mouth and eyes
-    inside_of = lambda rotations: np.asarray(inside_itself(body, np.float32(rotations)) & ~at_rest).mean()
-    inside = [inside_of(rotations) for rotations in drawn[:10]]
-    assert np.mean(inside) < INSIDE and np.max(inside) < 0.04
-    folded = np.zeros((kin.JOINTS, 3))
-    folded[[kin.LEFT_HIP, kin.RIGHT_HIP], 2] = -0.3, 0.3  # legs through each other
-    assert inside_of(folded) > 0.04
-
-
-def test_mirrored_goals_give_both_arms_the_same_freedom(build):
-    drawn = np.stack([sample_rotations(np.random.default_rng(seed), build) for seed in range(60)])
-    left = drawn[:, kin.LEFT_SHOULDER] * kin.MIRROR
-    right = drawn[:, kin.RIGHT_SHOULDER]
-    assert np.abs(left.mean(0) - right.mean(0)).max() < 0.35  # means of 60 draws of spread 0.6
+def test_mirrored_goals_give_both_arms_the_same_freedom(drawn):
+    left, right = drawn[:, kin.LEFT_SHOULDER] * kin.MIRROR, drawn[:, kin.RIGHT_SHOULDER]
+    assert np.abs(left.mean(0) - right.mean(0)).max() < 0.4  # means of 40 draws of spread 0.6
 
 
 def test_gestures_are_drawn_and_mirrored():

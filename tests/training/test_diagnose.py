@@ -159,9 +159,8 @@ def test_moments_and_averages_are_looked_at(body, batch, variables):
     assert "averaged parameters: decoder.trunk_0.bias, 1 entries, first at [3]" in str(faults[-1])
 
 
-@pytest.mark.parametrize(
-    "name", ["lca", *(pytest.param(name, marks=pytest.mark.slow) for name in (*PIXELS, *DRIVEN) if name != "lca")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*PIXELS, *DRIVEN])
 def test_networks_that_run_again_for_every_target_are_diagnosed(name):
     """Traced only: every parameter's gradient belongs to a stage."""
     config = dataclasses.replace(CONFIG, model=small(name), target_size=SIZE)

@@ -165,8 +165,8 @@ def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(body, 
 
 
 def test_sizes_of_a_later_stage_are_tried_before_the_run(body, captures, variables, tmp_path):
-    config = dataclasses.replace(CONFIG, stages=(Stage(50, target_size=8),))
-    with pytest.raises(ValueError, match="8 x 8 has no 11 x 11 window"):
+    config = dataclasses.replace(CONFIG, batch_size=2, microbatch_size=2, stages=(Stage(50, batch_size=3),))
+    with pytest.raises(ValueError, match="3 subjects per device cannot be divided into microbatches of 2"):
         train(config, body, captures[:2], tmp_path, variables=variables, progress=False)
     assert not (tmp_path / "log.jsonl").exists()
 

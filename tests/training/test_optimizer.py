@@ -1,6 +1,7 @@
 """The optimizer's groups, schedule and guard."""
 
 import dataclasses
+import functools
 import typing
 
 import jax
@@ -12,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rounding import bound
 
-from humangs_jax.core.configuration import config_from_json
 from humangs_jax.training.state import (
     INFINITY_STAND_IN,
     OptimizerConfig,
@@ -28,18 +28,18 @@ CONFIG = OptimizerConfig(learning_rate=0.1, warmup_steps=0)
 PARAMS = {"kernel": jnp.ones((2, 3)), "bias": jnp.ones(3), "texture": jnp.ones((3, 2, 2, 2)), "scale": jnp.ones(2)}
 
 
-def stepped(gradients, config=CONFIG, value=1.0, state=None, params=PARAMS):
+@functools.partial(jax.jit, static_argnames="config")
+def stepped(gradients, config=CONFIG, value=1.0, state=None):
     optimizer = make_optimizer(config, 100)
-    state = optimizer.init(params) if state is None else state
-    updates, state = optimizer.update(gradients, state, params, value=jnp.asarray(value))
-    return optax.apply_updates(params, updates), state
+    state = optimizer.init(PARAMS) if state is None else state
+    updates, state = optimizer.update(gradients, state, PARAMS, value=jnp.asarray(value))
+    return optax.apply_updates(PARAMS, updates), state
 
 
 def filled(value):
-    return jax.tree.map(lambda x: jnp.full_like(x, value), PARAMS)
+    return {name: np.full(x.shape, value, np.float32) for name, x in PARAMS.items()}
 
 
-@pytest.mark.slow
 def test_weight_decay_acts_on_two_axes_and_more():
     assert decayed(PARAMS) == {"kernel": True, "bias": False, "texture": True, "scale": False}
     params, _ = stepped(filled(0.0))
@@ -48,21 +48,15 @@ def test_weight_decay_acts_on_two_axes_and_more():
         np.testing.assert_allclose(leaf, shrunk if decayed(PARAMS)[name] else 1.0, rtol=FLOAT32)
 
 
-@pytest.mark.slow
-def test_first_step_is_adams_whatever_the_clipping():
-    params, state = stepped(filled(3.0))
-    assert float(state.norm) == pytest.approx(3 * np.sqrt(sum(x.size for x in PARAMS.values())), rel=bound(FLOAT32))
-    np.testing.assert_allclose(params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5)  # eps of Adam against the clipped
-
-
-@given(st.floats(1e-3, 16.0))  # beyond, the step is skipped
-def test_moments_see_clipped_gradients(size):
-    _, state = stepped(filled(size))
-    moments = [x for x in jax.tree.leaves(state.inner) if x.ndim]
-    first = moments[: len(PARAMS)]
+@pytest.mark.parametrize("size", [1e-3, 0.1, 0.5, 3.0, 16.0])  # beyond, the step is skipped
+def test_moments_see_clipped_gradients_and_the_first_step_is_adams(size):
+    params, state = stepped(filled(size))
+    first = [x for x in jax.tree.leaves(state.inner) if x.ndim][: len(PARAMS)]
     norm = float(gradient_norm(first)) / (1 - CONFIG.betas[0])
     unclipped = size * np.sqrt(sum(x.size for x in PARAMS.values()))
+    assert float(state.norm) == pytest.approx(unclipped, rel=bound(FLOAT32))
     assert norm == pytest.approx(min(unclipped, CONFIG.clip_norm), rel=1e-4)
+    np.testing.assert_allclose(params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5)  # eps of Adam against the clipped
 
 
 @pytest.mark.parametrize(
@@ -91,7 +85,7 @@ def test_gradients_become_finite_and_finite_ones_stay(values):
 
 def test_bad_entries_alone_skip_no_step():
     gradients = filled(0.1)
-    gradients["bias"] = jnp.asarray([jnp.nan, jnp.inf, -jnp.inf])
+    gradients["bias"] = np.asarray([np.nan, np.inf, -np.inf], np.float32)
     params, state = stepped(gradients)
     assert int(state.skipped) == 0
     assert float(params["bias"][0]) == 1.0 and float(params["bias"][1]) < 1 < float(params["bias"][2])
@@ -101,11 +95,8 @@ def test_schedule_warms_up_and_ends_at_zero():
     rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=10), 110)
     assert [float(rate(i)) for i in (0, 5, 10)] == pytest.approx([0.0, 0.2, 0.4])
     assert float(rate(60)) == pytest.approx(0.2, rel=1e-5) and float(rate(110)) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_run_shorter_than_its_warm_up_has_a_schedule():
-    rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4)
-    assert float(rate(4)) == pytest.approx(0.4)
+    shorter_than_its_warm_up = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4)
+    assert float(shorter_than_its_warm_up(4)) == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("name", typing.get_args(typing.get_type_hints(OptimizerConfig)["name"]))
@@ -115,8 +106,3 @@ def test_every_optimizer_by_name_goes_downhill_and_keeps_the_guard(name):
     assert all(np.isfinite(x).all() and (x < 1).all() for x in jax.tree.leaves(params))
     same, skipped = stepped(filled(1e4), config, state=state)
     assert int(skipped.skipped) == 1 and jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, PARAMS))
-
-
-def test_another_optimizer_is_refused():
-    with pytest.raises(ValueError, match=r"config\.name: expected .*adamw.*, got 'sgd'"):
-        config_from_json(OptimizerConfig, '{"name": "sgd"}')

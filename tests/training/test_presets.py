@@ -1,11 +1,9 @@
 """Every preset makes a step on all kinds of people that `humangs train` accepts: on disk, in a data set, made on the fly."""
 
 import dataclasses
-import functools
 import logging
 import math
 
-import jax
 import numpy as np
 import pytest
 from data.datasets.dataset_files import write_avatarrex, write_model
@@ -13,6 +11,7 @@ from data.datasets.dataset_files import write_avatarrex, write_model
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.data.loading import CaptureSource
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.losses.loss_networks import NO_NETWORKS
 from humangs_jax.people.bank import build_bank
@@ -20,7 +19,7 @@ from humangs_jax.people.subject import SPLITS
 from humangs_jax.training.config import PRESETS, fitting_losses
 from humangs_jax.training.sources import captured_people, mixed_people, on_the_fly_people, people_on_disk, stage_loader
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import seed_numbers, train_step, update
+from humangs_jax.training.step import train_step
 
 SIZE = 32
 KINDS = ("captures", "data set", "mixture")
@@ -54,22 +53,13 @@ def shrunk(name):
 def with_depths(make):
     """The same people with depths that are known."""
 
-    class Known:
-        def __init__(self, source):
-            self.source = source
-
-        def __getattr__(self, name):
-            return getattr(self.source, name)
-
-        def __len__(self):
-            return len(self.source)
-
+    class Known(CaptureSource):
         def example(self, *which):
-            example = self.source.example(*which)
+            example = super().example(*which)
             known = lambda views: replace(views, depths=2 * views.masks)
             return replace(example, inputs=known(example.inputs), targets=known(example.targets))
 
-    return lambda config: Known(make(config))
+    return lambda config: Known(**vars(make(config)))
 
 
 @pytest.fixture(scope="module")
@@ -83,26 +73,18 @@ MIXED = 1
 """A step whose examples are of both kinds; those of step 0 all come from the first source."""
 
 
-def traced(config, people, body):
-    """What a step would give, as shapes, and its batch."""
-    batch = stage_loader(people, config, 0).batch_at(MIXED)
-    body = gaussian_body(body, config.model)
-    state = jax.eval_shape(lambda: init_state(config))
-    step = functools.partial(update, networks=NO_NETWORKS, seed=seed_numbers(config.seed), config=config)
-    return jax.eval_shape(step, state, batch, body), batch
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_default_preset_takes_people_of_every_kind(kind, captures, body, data_set, caplog):
+    """It compares depths, which people on disk do not have: a batch has them all the same, as 0."""
     people = captured_people(captures, body)
     if kind == "data set":
-        people, body = data_set
+        people, _ = data_set
     if kind == "mixture":
         people = mixed_people([people, with_depths(people)], [1, 1])
     with caplog.at_level(logging.WARNING):
-        (_, metrics), batch = traced(shrunk("small"), people, body)
-    assert "depth" in metrics and "people on disk have no depths: loss.depth (weight 0.3) is 0" in caplog.text
-    known = np.asarray(batch.targets.depths).any(axis=(1, 2, 3))
+        depths = stage_loader(people, shrunk("small"), 0).batch_at(MIXED).targets.depths
+    assert "people on disk have no depths: loss.depth (weight 0.3) is 0" in caplog.text
+    known = np.asarray(depths).any(axis=(1, 2, 3))
     assert known.any() == (kind == "mixture") and not known.all()
 
 
