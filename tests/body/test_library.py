@@ -26,31 +26,19 @@ def joints(body):
     return dict(zip(JOINT_NAMES, np.asarray(shape_body(body, jnp.zeros(1)).joints), strict=True))
 
 
-def posed(body, **rotations):
-    pose = np.zeros((55, 3), np.float32)
-    for name, rotation in rotations.items():
-        pose[JOINT_NAMES.index(name)] = rotation
-    rest = shape_body(body, jnp.zeros(1))
-    return jax.jit(pose_body)(body, rest, BodyPose(jnp.asarray(pose), jnp.zeros(3)))
-
-
 def test_sizes(body):
     assert body.template.shape == (13380, 3) and body.faces.shape == (26756, 3)
     assert body.joint_names == JOINT_NAMES and body.parents == PARENTS
     assert len(JOINT_NAMES) == len(PARENTS) == 55
+    assert [JOINT_NAMES[i] for i in (25, 28, 31, 34, 39, 40, 54)] == [
+        *("left_index1", "left_middle1", "left_pinky1", "left_ring1", "left_thumb3", "right_index1", "right_thumb3")
+    ]
+    assert [PARENTS[i] for i in (25, 26, 27, 28, 40, 41, 22)] == [20, 25, 26, 20, 21, 40, 15]
     assert len(body.shape_names) == body.shape_directions.shape[-1] >= 10
     assert {"sex_male", "age", "weight", "muscle", "height", "leg_length", "head_size"} <= set(body.shape_names)
     assert body.template.dtype == jnp.float32
     assert (resources.files("humangs_jax") / "assets" / "makehuman.npz").stat().st_size < 3 * MEGABYTE
     assert "CC0" in (resources.files("humangs_jax") / "assets" / "makehuman.LICENSE.md").read_text()
-
-
-def test_finger_joints_are_in_order():
-    assert JOINT_NAMES[25:31] == (*(f"left_index{i}" for i in (1, 2, 3)), *(f"left_middle{i}" for i in (1, 2, 3)))
-    assert [JOINT_NAMES[i] for i in (31, 34, 37, 40, 54)] == [
-        *("left_pinky1", "left_ring1", "left_thumb1", "right_index1", "right_thumb3")
-    ]
-    assert [PARENTS[i] for i in (25, 26, 27, 28, 40, 41, 22)] == [20, 25, 26, 20, 21, 40, 15]
 
 
 def test_a_person_of_ordinary_size_in_t_pose(body, joints):
@@ -104,43 +92,39 @@ def test_the_surface_is_closed_and_faces_outwards(body):
 
 
 def test_shapes_are_plausible_people_and_keep_the_pelvis(body):
-    faces = np.asarray(body.faces)
+    faces, shaped = np.asarray(body.faces), jax.jit(shape_body)
+    height = lambda rest: float(np.ptp(np.asarray(rest.vertices)[:, 1]))
+    rests = {}
     for i, name in enumerate(body.shape_names):
         for sign in (-2.0, 2.0):
-            rest = shape_body(body, jnp.zeros(len(body.shape_names)).at[i].set(sign))
-            assert 1.45 < np.ptp(np.asarray(rest.vertices)[:, 1]) < 1.9, name
+            rest = rests[name, sign] = shaped(body, jnp.zeros(len(body.shape_names)).at[i].set(sign))
+            assert 1.45 < height(rest) < 1.9, name
             assert 0.035 < signed_volume(rest.vertices, faces) < 0.1, name
             assert np.allclose(rest.joints[0], [0, -0.35, 0], atol=6e-3), name
-            arm = np.asarray(rest.joints)[[16, 18, 20], 1]
-            assert np.ptp(arm) < 0.02, name  # still a T-pose
-    index = body.shape_names.index
-    taller = shape_body(body, jnp.zeros(22).at[index("height")].set(1.0))
-    longer = shape_body(body, jnp.zeros(22).at[index("leg_length")].set(1.0))
-    mean = shape_body(body, jnp.zeros(1))
-    leg = lambda rest: float(rest.joints[1, 1] - rest.joints[7, 1])
-    height = lambda rest: float(np.ptp(np.asarray(rest.vertices)[:, 1]))
-    assert height(taller) > height(mean) + 0.03 and leg(longer) > leg(mean) + 0.03
+            assert np.ptp(np.asarray(rest.joints)[[16, 18, 20], 1]) < 0.02, name  # still a T-pose
+    assert height(rests["height", 2.0]) > height(rests["height", -2.0]) + 0.1
+    legs = [float(rests["leg_length", sign].joints[1, 1] - rests["leg_length", sign].joints[7, 1]) for sign in (-2.0, 2.0)]
+    assert legs[1] > legs[0] + 0.1
 
 
 def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
-    elbow = posed(body, left_elbow=(0, -np.pi / 2, 0))
-    wrist = np.asarray(elbow.joints[20])
+    pose = jax.jit(lambda rotations: pose_body(body, shape_body(body, jnp.zeros(1)), BodyPose(rotations, jnp.zeros(3))))
+
+    def posed(**rotations):
+        vectors = np.zeros((55, 3), np.float32)
+        for name, rotation in rotations.items():
+            vectors[JOINT_NAMES.index(name)] = rotation
+        return pose(vectors)
+
+    wrist = np.asarray(posed(left_elbow=(0, -np.pi / 2, 0)).joints[20])
     assert wrist[2] > joints["left_elbow"][2] + 0.15 and abs(wrist[0] - joints["left_elbow"][0]) < 0.02
-    knee = posed(body, right_knee=(np.pi / 2, 0, 0))
-    assert knee.joints[8, 2] < joints["right_knee"][2] - 0.3  # the heel goes back
-    arms = posed(body, left_shoulder=(0, 0, -1.2), right_shoulder=(0, 0, 1.2))
-    assert arms.joints[20, 1] < joints["left_shoulder"][1] - 0.3 and arms.joints[21, 1] < joints["left_shoulder"][1] - 0.3
-    turned = posed(body, head=(0, 0.8, 0))
-    nose = int(np.argmax(_face_front(body)))
-    assert turned.vertices[nose, 0] > 0.04  # towards the person's left
-    assert np.allclose(
-        turned.vertices[np.asarray(body.template)[:, 1] < 0], body.template[np.asarray(body.template)[:, 1] < 0], atol=1e-5
-    )
-
-
-def _face_front(body):
-    """z of the vertices of the head, -1 elsewhere."""
-    return np.where(np.asarray(body.skinning_weights)[:, 15] > 0.9, np.asarray(body.template)[:, 2], -1)
+    assert posed(right_knee=(np.pi / 2, 0, 0)).joints[8, 2] < joints["right_knee"][2] - 0.3  # the heel goes back
+    arms = posed(left_shoulder=(0, 0, -1.2), right_shoulder=(0, 0, 1.2))
+    assert np.asarray(arms.joints)[[20, 21], 1].max() < joints["left_shoulder"][1] - 0.3
+    turned, template = posed(head=(0, 0.8, 0)), np.asarray(body.template)
+    face = np.where(np.asarray(body.skinning_weights)[:, 15] > 0.9, template[:, 2], -1)
+    assert turned.vertices[int(np.argmax(face)), 0] > 0.04  # the nose goes towards the person's left
+    assert np.allclose(turned.vertices[template[:, 1] < 0], template[template[:, 1] < 0], atol=1e-5)
 
 
 def test_own_files_keep_a_body(tmp_path):

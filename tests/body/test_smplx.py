@@ -167,11 +167,11 @@ def test_a_pickle_with_sparse_and_chumpy_arrays_is_the_same_model(tmp_path, spar
         assert np.array_equal(a, b)
 
 
-@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
-def test_every_pickle_protocol_is_read(tmp_path, protocol):
+def test_every_pickle_protocol_is_read(tmp_path):
     arrays = made_up_file()
-    (tmp_path / "model.pkl").write_bytes(pickle.dumps(arrays, protocol=protocol))
-    assert np.allclose(load_smplx(tmp_path / "model.pkl").template, arrays["v_template"], atol=ATOL)
+    for protocol in (0, 2, 4, 5):
+        (tmp_path / "model.pkl").write_bytes(pickle.dumps(arrays, protocol=protocol))
+        assert np.allclose(load_smplx(tmp_path / "model.pkl").template, arrays["v_template"], atol=ATOL)
 
 
 def broken(**changes):

@@ -62,7 +62,6 @@ POSES = {
     "facing away": {"pelvis": (0, 3.0, 0), "left_elbow": (0, -1.0, 0)},
 }
 """Rotation vectors of the left side; the right side mirrors them."""
-NAMES_WITHIN_LIMITS = tuple(POSES)
 
 
 def rotations_of(pose):

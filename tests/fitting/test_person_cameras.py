@@ -31,13 +31,18 @@ NOISY_DEGREES, NOISY_METRES = 3.5, 0.25
 @pytest.mark.parametrize(
     ("views", "pose"), [(4, "crouching"), *(pytest.param(views, "standing", marks=pytest.mark.slow) for views in (3, 8))]
 )
-def test_exact_landmarks_give_exact_cameras(views, pose):
+def test_exact_landmarks_give_exact_cameras_of_a_person_who_stands_upright_and_looks_at_plus_z(views, pose):
     matrices = cameras_around(views)
     found = cameras_from_person(seen_by(posed(pose), matrices))
     angles, centers, _ = errors_of(found, matrices)
     assert found.moments == 1 and found.views == tuple(range(views)) and not found.mirrored.any()
     assert angles.max() < EXACT_DEGREES and centers.max() < EXACT_METRES
     assert found.errors.max() < 0.5
+    points = found.landmarks[0]
+    at = lambda name: points[NAMES.index(name)]
+    assert points[:, 1].min() == pytest.approx(0, abs=1e-6)
+    assert at("nose")[1] > at("left_hip")[1] > at("left_ankle")[1]
+    assert at("left_shoulder")[0] > at("right_shoulder")[0] and at("nose")[2] > at("left_ear")[2]
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -49,35 +54,22 @@ def test_noise_of_a_detector(seed):
 
 
 def test_the_height_sets_the_scale():
-    matrices, landmarks = cameras_around(4), posed()
-    scales = []
-    for height in (None, 1.5, 1.8):
-        found = cameras_from_person(seen_by(landmarks, matrices, size=0.9), height=height)
-        scales.append(1 / errors_of(found, matrices)[2])
-    assert scales[0] == pytest.approx(0.9, rel=0.03)
-    assert scales[2] / scales[1] == pytest.approx(1.8 / 1.5, rel=1e-4)
-    assert any("height is not given" in line for line in cameras_from_person(seen_by(landmarks, matrices)).warnings)
+    matrices, seen = cameras_around(3), seen_by(posed(), cameras_around(3), size=0.9)
+    found = {height: cameras_from_person(seen, height=height) for height in (None, 1.5, 1.8)}
+    scales = {height: 1 / errors_of(each, matrices)[2] for height, each in found.items()}
+    assert scales[None] == pytest.approx(0.9, rel=0.03) and scales[1.8] / scales[1.5] == pytest.approx(1.2, rel=1e-4)
+    assert any("height is not given" in line for line in found[None].warnings)
 
 
-def test_the_person_stands_upright_and_looks_at_plus_z():
-    found = cameras_from_person(seen_by(posed(), cameras_around(4)))
-    points = found.landmarks[0]
-    at = lambda name: points[NAMES.index(name)]
-    assert points[:, 1].min() == pytest.approx(0, abs=1e-6)
-    assert at("nose")[1] > at("left_hip")[1] > at("left_knee")[1] > at("left_ankle")[1]
-    assert at("left_shoulder")[0] > at("right_shoulder")[0] and at("nose")[2] > at("left_ear")[2]
-
-
-@pytest.mark.parametrize("view", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_mirrored_view_is_found(view):
-    matrices = cameras_around(4)
+def test_a_mirrored_view_is_found():
+    matrices = cameras_around(3)
     seen = seen_by(posed("crouching"), matrices, **NOISE | {"turn": 0.0})
     points, world = seen.points.copy(), seen.world.copy()
-    points[view], world[view] = points[view][MIRRORED], world[view][MIRRORED]
+    points[1], world[1] = points[1][MIRRORED], world[1][MIRRORED]
     found = cameras_from_person(dataclasses.replace(seen, points=points, world=world))
-    assert found.mirrored.tolist() == [v == view for v in range(4)]
+    assert found.mirrored.tolist() == [False, True, False]
     assert errors_of(found, matrices)[0].mean() < NOISY_DEGREES
-    assert any(f"p{view}.jpg: the detector exchanged left and right" in line for line in found.warnings)
+    assert any("p1.jpg: the detector exchanged left and right" in line for line in found.warnings)
 
 
 @pytest.mark.slow
@@ -108,19 +100,13 @@ def test_one_photo_is_enough_for_its_own_camera():
     assert np.linalg.norm(np.asarray(found.cameras[0].cam_from_world)[:3, 3]) == pytest.approx(true, rel=0.15)
 
 
-def several_moments():
-    changes = (("standing", 0, 0.0), ("crouching", 0, 0.4), ("standing", 5, 0.5), ("crouching", 7, 0.5))
-    return seen_by(np.stack([posed(*change) for change in changes]), cameras_around(4))
-
-
-def test_photos_of_several_moments_are_told():
-    with pytest.raises(SeveralMomentsError, match="% of the person's size"):
-        cameras_of_moment(several_moments())
-
-
 @pytest.mark.slow
-def test_photos_of_several_moments_stand_alone():
-    found = cameras_from_person(several_moments())
+def test_photos_of_several_moments_are_told_and_stand_alone():
+    changes = (("standing", 0, 0.0), ("crouching", 0, 0.4), ("standing", 5, 0.5), ("crouching", 7, 0.5))
+    seen = seen_by(np.stack([posed(*change) for change in changes]), cameras_around(4))
+    with pytest.raises(SeveralMomentsError, match="% of the person's size"):
+        cameras_of_moment(seen)
+    found = cameras_from_person(seen)
     assert found.moments == 4 and len(found.cameras) == 4 and found.landmarks.shape == (4, len(NAMES), 3)
 
 
@@ -202,8 +188,7 @@ def off(capture, truth):
     return np.degrees(np.linalg.norm(quaternion.to_axis_angle(quaternion.from_matrix(between)), axis=-1))
 
 
-@pytest.mark.parametrize("views", [3, 4, 6])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("views", "seed"), [(3, 1), (6, 0)])
 def test_a_camera_turned_by_a_degree_is_named_and_turned_back_and_right_ones_are_left(views, seed):
     truth, keypoints = person(seed, 1, views)
     assert find_camera_errors(truth, keypoints) == ()
@@ -215,11 +200,11 @@ def test_a_camera_turned_by_a_degree_is_named_and_turned_back_and_right_ones_are
 
 
 def test_all_moments_of_a_camera_that_stands_still_count_and_two_cameras_may_be_off():
-    truth, keypoints = person(3, 8, 4, still=True, even=True)
+    truth, keypoints = person(3, 4, 4, still=True, even=True)
     assert find_camera_errors(truth, keypoints) == ()
-    wrong = turned(turned(truth, [1, 5, 9, 13, 17, 21, 25, 29], (1.0, 0.0, 0.3)), range(2, 32, 4), (-0.8, 0.3, 0.0))
+    wrong = turned(turned(truth, range(1, 16, 4), (1.0, 0.0, 0.3)), range(2, 16, 4), (-0.8, 0.3, 0.0))
     errors = find_camera_errors(wrong, keypoints)
-    assert sorted(error.views[0] for error in errors) == [1, 2] and all(len(error.views) == 8 for error in errors)
+    assert sorted(error.views[0] for error in errors) == [1, 2] and all(len(error.views) == 4 for error in errors)
     assert off(mended(wrong, errors), truth).max() < TURN
 
 
@@ -232,12 +217,12 @@ def late(keypoints, cameras, frames):
     return dataclasses.replace(keypoints, points=points, confidences=confidences)
 
 
-@pytest.mark.parametrize(("seed", "by"), [(0, 0), (0, 1), (0, 3), (1, 0), (1, 2), (1, -2)])
+@pytest.mark.parametrize(("seed", "by"), [(0, 0), (0, 3), (1, -2)])
 def test_a_camera_that_is_late_is_named_and_no_camera_that_is_right(seed, by):
     truth, keypoints = person(seed, 24, VIEWS, still=True, moving=True, outliers=0.05)
     found = find_camera_errors(truth, late(keypoints, [1], [by]))
     assert [(error.names, error.late, error.degrees) for error in found] == ([(("m0v1",), by, 0.0)] if by else [])
-    when = {1: "1 frame late", 2: "2 frames late", 3: "3 frames late", -2: "2 frames early"}
+    when = {3: "3 frames late", -2: "2 frames early"}
     assert by == 0 or str(found[0]) == f"camera m0v1 is {when[by]}"
 
 
@@ -246,11 +231,8 @@ def test_a_turned_camera_is_not_taken_for_a_late_one_and_both_are_found():
     wrong = turned(truth, range(2, 24 * VIEWS, VIEWS), (1.0, 0.0, 0.3))
     (error,) = find_camera_errors(wrong, keypoints)
     assert error.late == 0 and error.names == ("m0v2",)
-    delayed = late(keypoints, [0], [2])
-    both = find_camera_errors(wrong, delayed)
+    both = find_camera_errors(wrong, late(keypoints, [0], [2]))
     assert [(error.names, error.late) for error in both] == [(("m0v0",), 2), (("m0v2",), 0)]
-    warnings = " ".join(examine(wrong, delayed).report.warnings)
-    assert "camera m0v0 is 2 frames late" in warnings and "camera m0v2 is off by" in warnings
 
 
 def test_of_a_person_who_stands_nobody_is_late():

@@ -134,16 +134,7 @@ def test_a_start_that_is_right_stays():
 
 
 @pytest.mark.slow
-def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
-    masks = np.zeros_like(truth().masks)
-    masks[0] = truth().masks[0]
-    refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
-    assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
-
-
-@pytest.mark.slow
-def test_a_view_with_an_empty_mask_takes_no_part():
+def test_views_with_an_empty_mask_take_no_part():
     masks = np.array(truth().masks)
     masks[1] = 0
     refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
@@ -151,6 +142,10 @@ def test_a_view_with_an_empty_mask_takes_no_part():
     assert refined.report.errors["silhouette_iou"].after > 0.93
     moved = refined.capture.cameras.cam_from_world - augmented().cameras.cam_from_world
     assert np.abs(moved[1]).max() < 1e-4 < np.abs(moved[0]).max(), "nothing is known of its camera"
+    masks[2] = 0
+    refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
+    assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
 
 @pytest.mark.slow
@@ -162,21 +157,14 @@ def test_cameras_that_look_the_other_way_are_told_and_left():
     assert "the start was too far off" in str(refined.report)
 
 
-@pytest.mark.slow  # compiles once more
-def test_one_view_is_refined_by_its_boundary():
-    refined = refine_capture(augmented().select([0]), config=CONFIG)
-    assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("masks", [None, np.zeros((VIEWS, SIZE, SIZE), np.float32)])
-def test_nothing_to_refine_by_is_an_error(masks):
-    blind = dataclasses.replace(truth(), masks=masks)
-    with pytest.raises(CaptureError, match="masks: none shows anybody, and there are no keypoints"):
-        refine_capture(blind)
-    with pytest.raises(CaptureError, match="no keypoints"):
-        refine_capture(blind, keypoints=keypoints(confidence=0.0))
+def test_nothing_to_refine_by_is_an_error_and_keypoints_of_other_views_are():
+    for masks in (None, np.zeros((VIEWS, SIZE, SIZE), np.float32)):
+        blind = dataclasses.replace(truth(), masks=masks)
+        for known in (None, keypoints(confidence=0.0)):
+            with pytest.raises(CaptureError, match="masks: none shows anybody, and there are no keypoints"):
+                refine_capture(blind, keypoints=known)
+    with pytest.raises(ValueError, match="of 3 views, but the capture has 2"):
+        refine_capture(truth().select([0, 1]), keypoints=keypoints())
 
 
 @pytest.mark.parametrize(
@@ -232,11 +220,6 @@ def test_keypoints_weigh_by_the_noise_that_the_body_finds():
         expected = scene.observations.noise
         noises.append(np.asarray(scene.look(start_state(scene.origin, CONFIG), 5.0).keypoints.noise / expected))
     assert noises[0] == pytest.approx(0.5) and (noises[1] > 5).all()
-
-
-def test_keypoints_of_other_views_are_an_error():
-    with pytest.raises(ValueError, match="of 3 views, but the capture has 2"):
-        refine_capture(truth().select([0, 1]), keypoints=keypoints())
 
 
 # Silhouettes of a sphere and of a disc, which are known, and what of two silhouettes belongs together -----------------

@@ -136,13 +136,6 @@ def test_smoothness_that_the_keypoints_contradict_is_not_forced(walk):
     )
 
 
-@pytest.mark.slow
-def test_nothing_seen_at_all_is_finite(walk):
-    seen, start, _ = walk
-    fit = smoothed(without(seen, range(FRAMES)), start, range(FRAMES))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((fit.joints, fit.state)))
-
-
 @jax.jit
 def bridged(seen, state):
     problem = keypoint_problem(MODEL)

@@ -94,13 +94,9 @@ def test_of_noisy_points_the_pixels_errors_are_least():
     assert (cost(points) < least).all()
 
 
-def test_one_view_has_no_points_in_space():
-    _, seen = scene(views=1)
-    points, counts, _ = robust(seen)
+def test_one_view_has_no_points_in_space_and_parallel_rays_stay_finite():
+    points, counts, _ = robust(scene(views=1)[1])
     assert not np.asarray(counts).any() and np.isfinite(points).all()
-
-
-def test_parallel_rays_stay_finite():
     _, seen = scene(views=2)
     same = jax.tree.map(lambda leaf: leaf.at[:, 1].set(leaf[:, 0]) if leaf.ndim > 1 else leaf, seen)
     assert np.isfinite(plain(same)[0]).all() and np.isfinite(robust(same)[0]).all()
@@ -134,24 +130,19 @@ def random_similarity(seed):
     return Similarity(scale, Rotation.random(rng=rng).as_matrix(), scale * rng.normal(size=3))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_similarity_between_points_is_found(seed):
+@pytest.mark.parametrize("seed", range(3))
+def test_the_similarity_between_points_is_found_and_those_without_weight_do_not_count(seed):
     true, points = random_similarity(seed), np.random.default_rng(seed).normal(size=(6, 3))
-    found = align_points(points, true(points), np.ones(6))
+    target = true(points)
+    np.testing.assert_allclose(align_points(points, target, np.ones(6)).matrix(), true.matrix(), atol=1e-9 * true.scale)
+    target[5] += 100
+    found = align_points(points, target, np.asarray([1.0, 1, 1, 1, 1, 0]))
     np.testing.assert_allclose(found.matrix(), true.matrix(), atol=1e-9 * true.scale)
 
 
 def test_mirrored_points_get_a_proper_rotation():
     points = np.random.default_rng(0).normal(size=(8, 3))
     assert np.linalg.det(align_points(points, points * [-1, 1, 1], np.ones(8)).rotation) == pytest.approx(1)
-
-
-def test_points_without_weight_do_not_count():
-    true, points = random_similarity(1), np.random.default_rng(1).normal(size=(6, 3))
-    target = true(points)
-    target[5] += 100
-    found = align_points(points, target, np.asarray([1.0, 1, 1, 1, 1, 0]))
-    np.testing.assert_allclose(found.matrix(), true.matrix(), atol=1e-9 * true.scale)
 
 
 def test_a_wild_point_is_outweighed():
@@ -244,7 +235,7 @@ def test_of_four_views_two_and_two():
     )
 
 
-@pytest.mark.parametrize("views", [3, 4, 8])
+@pytest.mark.parametrize("views", [3, 8])
 def test_cameras_of_two_views(views):
     capture, keypoints = person(13, 4, views, outliers=0.1)
     order = np.arange(4 * views)
@@ -262,11 +253,6 @@ def test_evenly_spaced_cameras_have_two_explanations():
     (swap,) = found(capture, changed(keypoints, order))
     assert {" and ".join(swap.views), *swap.instead} == {"m0v0 and m0v2", "m0v1 and m0v3"}
     assert str(swap).endswith("instead)")
-
-
-def test_cameras_of_two_views_cannot_be_told_from_two():
-    capture, keypoints = person(14, 4, 2)
-    assert all(swap.kind != "cameras" for swap in found(capture, changed(keypoints, [1, 0, 2, 3, 4, 5, 6, 7])))
 
 
 def test_cameras_that_stand_still_are_reported_once():
@@ -308,22 +294,17 @@ def test_one_view_and_views_that_are_missing():
     assert found(capture, blind) == ()
 
 
-@pytest.mark.parametrize(
-    "given, other, better", [(10.0, 5.0, True), (10.0, 7.0, False), (1000.0, 900.0, True), (1000.0, 950.0, False)]
-)
-def test_mirrored_people(monkeypatch, given, other, better):
+def test_mirrored_people(monkeypatch):
     """By what a fit to the mirrored keypoints costs; that it finds the people themselves is measured, not tested here."""
     fit = lambda cost: types.SimpleNamespace(outcomes={"hands": types.SimpleNamespace(after=jnp.full(4, cost / 4))})
     capture, keypoints = person(19, 4, 2)
     observations, kind, _ = seen(capture, keypoints)
-    asked = []
-    monkeypatch.setattr(module, "fit_landmarks", lambda model, seen: asked.append(seen) or fit(other))
-    swaps = _unchecked(find_mirrored)(None, observations, kind, fit(given))
-    np.testing.assert_array_equal(asked[0].points, np.asarray(observations.points)[:, :, MIRROR])
-    assert len(swaps) == better
-    for swap in swaps:
-        assert swap.kind == "all sides"
-        assert "in all views" in str(swap)
+    for given, other, better in ((10.0, 5.0, True), (10.0, 7.0, False), (1000.0, 900.0, True), (1000.0, 950.0, False)):
+        asked = []
+        monkeypatch.setattr(module, "fit_landmarks", lambda _, seen, asked=asked, other=other: asked.append(seen) or fit(other))
+        swaps = _unchecked(find_mirrored)(None, observations, kind, fit(given))
+        np.testing.assert_array_equal(asked[0].points, np.asarray(observations.points)[:, :, MIRROR])
+        assert [swap.kind for swap in swaps] == ["all sides"] * better and all("in all views" in str(swap) for swap in swaps)
 
 
 def _unchecked(function):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from humangs_jax.geometry import camera as cameras
-from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, pixel_rays, plucker_rays
 from humangs_jax.geometry.transform import along_curve
 
@@ -21,8 +20,7 @@ def ring(n=5, size=32):
 
 
 def test_orbit_looks_at_its_target_right_side_up():
-    for i in range(5):
-        c = ring()[i]
+    for c in ring(3):
         uv, depth = cameras.project(c, jnp.asarray([[0.1, 0.9, 0.0], [0.1, 1.1, 0.0]]))
         assert np.allclose(uv[0], 16, atol=1e-3) and np.isclose(depth[0], 2, atol=ATOL)
         assert uv[1, 1] < uv[0, 1]  # y up in the world is up in the image, whose y points down
@@ -31,16 +29,10 @@ def test_orbit_looks_at_its_target_right_side_up():
     assert uv[0, 0] > 16  # seen from +z, the world's +x is on the right
 
 
-def test_transforms_compose_and_invert():
-    c = ring()[2]
-    identity = c.world_from_cam @ c.cam_from_world
-    assert np.allclose(identity, np.eye(4), atol=ATOL)
-    assert np.allclose(transform.apply(c.world_from_cam, jnp.zeros(3)), c.center, atol=ATOL)
-
-
 def test_rays_pass_through_the_pixel_centres_they_belong_to():
     c = ring()[3]
     origin, directions = pixel_rays(c)
+    assert np.allclose(c.world_from_cam @ c.cam_from_world, np.eye(4), atol=ATOL) and np.allclose(origin, c.center)
     assert np.allclose(np.linalg.norm(directions, axis=-1), 1, atol=ATOL)
     uv, _ = cameras.project(c, origin + 1.7 * directions[5, 9])
     assert np.allclose(uv, [9.5, 5.5], atol=1e-3)
@@ -56,12 +48,6 @@ def test_resizing_and_units_keep_the_image():
     scaled, scaled_depth = cameras.project(c.in_units(0.5), point / 0.5)
     assert np.allclose(other, np.asarray(uv) * [2, 0.75], atol=1e-3)
     assert np.allclose(scaled, uv, atol=1e-3) and np.isclose(scaled_depth, depth / 0.5, atol=ATOL)
-
-
-def test_gradients_reach_the_pose_and_the_intrinsics():
-    c = ring()[0]
-    gradient = jax.grad(lambda c: cameras.project(c, jnp.asarray([0.2, 1.0, 0.1]))[0].sum())(c)
-    assert np.abs(gradient.K).max() > 0 and np.abs(gradient.cam_from_world).max() > 0
 
 
 def test_from_opencv_is_traced_and_differentiated():
@@ -122,8 +108,4 @@ def test_neighbours_along_the_curve_are_neighbours_in_space():
     ordered = np.asarray(positions)[np.argsort(ranks)]
     steps = np.linalg.norm(np.diff(ordered, axis=0), axis=-1).mean()
     assert steps < 0.4 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).mean()
-
-
-def test_points_off_the_curve_are_on_its_border():
-    positions = jnp.asarray([[-9.0, -9.0, -9.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
-    assert along_curve(positions, 1.0).tolist() == [0, 1, 2]
+    assert along_curve(jnp.asarray([[-9.0, -9.0, -9.0], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]]), 1.0).tolist() == [0, 1, 2]

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from humangs_jax.geometry.mesh import face_areas, face_crosses, smallest_turns, unit, vertex_areas
+from humangs_jax.geometry.mesh import directions_around, face_areas, face_crosses, in_front, smallest_turns, unit, vertex_areas
 
 EXACT = 1e-9
 directions = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.asarray).filter(lambda v: np.abs(v).max() > 1e-3)
@@ -37,3 +37,16 @@ def test_opposite_directions_are_half_a_turn_apart_and_nothing_turns_nothing():
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     np.testing.assert_allclose(np.einsum("nab,nb->na", smallest_turns(axes, -axes), axes), -axes, atol=EXACT)
     np.testing.assert_array_equal(smallest_turns(np.zeros(3), axes), np.broadcast_to(np.eye(3), (6, 3, 3)))
+
+
+def test_directions_are_spread_and_what_is_behind_is_not_seen():
+    directions = directions_around(48)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+    nearest = np.sort(directions @ directions.T, axis=1)[:, -2]
+    assert np.degrees(np.arccos(nearest)).min() > 15
+    x, y = np.meshgrid(np.arange(8.0), np.arange(5.0))
+    wall = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    for forward in (np.asarray([0, 0, 1.0]), np.asarray([0, 0, -1.0])):
+        both = np.concatenate([wall, wall + forward])
+        seen = in_front(both, both, forward, 0.9, 0.5)
+        assert seen[: len(wall)].all() and not seen[len(wall) :].any()

@@ -60,9 +60,8 @@ def test_between_turns_one_direction_into_the_other_the_short_way(seed, batch, c
         assert close(q, jnp.broadcast_to(jnp.asarray(quaternion.IDENTITY), q.shape), atol=1e-5)
 
 
-@pytest.mark.parametrize("axis", range(3))
-def test_half_turns_convert_back(axis):
-    q = jnp.zeros(4).at[axis + 1].set(1.0)
+def test_half_turns_convert_back():
+    q = jnp.eye(4)[1:]
     assert close(jnp.abs(quaternion.from_matrix(quaternion.to_matrix(q))), q)
 
 
@@ -79,9 +78,9 @@ def test_axis_angle_agrees_with_the_matrix_exponential(seed, exponent):
 
 
 def test_derivative_at_no_rotation_is_the_generator():
-    jacobian = jax.jacobian(quaternion.matrix_from_axis_angle)(jnp.zeros(3))
-    assert close(jacobian[..., 2], jnp.asarray([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]]))
-    assert close(jax.jacobian(quaternion.from_axis_angle)(jnp.zeros(3))[1:], 0.5 * jnp.eye(3))
+    both = lambda v: (quaternion.matrix_from_axis_angle(v), quaternion.from_axis_angle(v))
+    matrix, q = jax.jit(jax.jacfwd(both))(jnp.zeros(3))
+    assert close(matrix[..., 2], jnp.asarray([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])) and close(q[1:], 0.5 * jnp.eye(3))
 
 
 @pytest.mark.slow
@@ -127,8 +126,8 @@ def test_factors_rebuild_the_gram_matrix(dtype, tolerance, seed, stretch):
     assert np.allclose(np.sort(s, -1)[:, ::-1], expected, rtol=0, atol=tolerance * expected.max())
 
 
-@pytest.mark.parametrize("m", [np.zeros((3, 3)), np.eye(3), np.outer([1, 2, 3], [1, 0, 1]), np.diag([1, 1e-20, 0]), -np.eye(3)])
-def test_degenerate_matrices_give_rotations(m):
-    u, s = map(np.asarray, left_singular_vectors(jnp.asarray(m, jnp.float32)))
-    assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE)
-    assert np.allclose(u @ np.diag(s**2) @ u.T, m @ m.T, atol=FLOAT32_TOLERANCE * max(1, np.abs(m @ m.T).max()))
+def test_degenerate_matrices_give_rotations():
+    cases = np.stack([np.zeros((3, 3)), np.eye(3), np.outer([1, 2, 3], [1, 0, 1]), np.diag([1, 1e-20, 0]), -np.eye(3)])
+    for m, u, s in zip(cases, *map(np.asarray, jax.jit(left_singular_vectors)(jnp.asarray(cases, jnp.float32))), strict=True):
+        assert np.allclose(u.T @ u, np.eye(3), atol=FLOAT32_TOLERANCE) and np.isclose(np.linalg.det(u), 1, atol=FLOAT32_TOLERANCE)
+        assert np.allclose(u @ np.diag(s**2) @ u.T, m @ m.T, atol=FLOAT32_TOLERANCE * max(1, np.abs(m @ m.T).max()))
