@@ -104,7 +104,7 @@ def integer_centers(K):
     return K
 
 
-def write_easymocap(folder, K, poses, names, decimals=6, dist=(0.0,) * 5):
+def write_easymocap(folder, K, poses, names, decimals=9, dist=(0.0,) * 5):
     folder.mkdir(parents=True, exist_ok=True)
     header = "%YAML:1.0\n---\nnames:\n" + "".join(f'  - "{name}"\n' for name in names)
     inner, outer = header, header

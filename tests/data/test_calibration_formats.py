@@ -32,47 +32,33 @@ def error_of(out, K, poses):
     return np.abs(np.asarray(got) - np.asarray(true)).max()
 
 
-def write(kind, folder, K, poses):
-    """A calibration in that format of those source-world poses, and photos: (source, images)."""
-    images = folder / "photos"
-    files = FILES
-    source = folder / kind
-    if kind == "colmap":
-        files = ["front view.png", "left/1.png", "right/1.png", "back.png"]
-        written.write_colmap(source / "sparse" / "0", K, poses, files)
-    elif kind == "easymocap":
-        written.write_easymocap(source, K, poses, NAMES, decimals=9)
-    elif kind == "yaml":
-        source = folder / "rig.yml"
-        written.write_opencv_yaml(source, K, poses, NAMES)
-    elif kind == "json":
-        source = folder / "rig.json"
-        written.write_opencv_json(source, K, poses, NAMES)
-    elif kind == "full":
-        source = folder / "calibration_full.json"
-        written.write_calibration_full(source, K, poses, NAMES)
-    else:
-        source = folder / "transforms.json"
-        written.write_transforms(source, K, poses, [f"./images/{name}" for name in NAMES])
-    written.write_photos(images, files)
-    return source, images
+def rig(folder, writer, name, K, poses, names=NAMES, **how):
+    """A calibration by one of the writers, and photos beside it: (source, images)."""
+    writer(folder / name, K, poses, names, **how)
+    written.write_photos(folder / "photos", FILES)
+    return folder / name, folder / "photos"
 
 
-# format, its default up axis, and the turn from our world into one with that axis up
-FORMATS = [
-    ("colmap", np.diag([1.0, -1, -1])),
-    ("easymocap", written.Y_UP_FROM_Z_UP.T),
-    ("yaml", np.diag([1.0, -1, -1])),
-    ("json", np.diag([1.0, -1, -1])),
-    ("full", np.diag([1.0, -1, -1])),
-    ("transforms", written.Y_UP_FROM_Z_UP.T),
-]
+Y_DOWN, Z_UP = np.diag([1.0, -1, -1]), written.Y_UP_FROM_Z_UP.T
+COLMAP_FILES = ["front view.png", "left/1.png", "right/1.png", "back.png"]
+FORMATS = {
+    "colmap": (written.write_colmap, "model/sparse/0", Y_DOWN, COLMAP_FILES),
+    "easymocap": (written.write_easymocap, "easymocap", Z_UP, NAMES),
+    "yaml": (written.write_opencv_yaml, "rig.yml", Y_DOWN, NAMES),
+    "json": (written.write_opencv_json, "rig.json", Y_DOWN, NAMES),
+    "full": (written.write_calibration_full, "calibration_full.json", Y_DOWN, NAMES),
+    "transforms": (written.write_transforms, "transforms.json", Z_UP, [f"./images/{file}" for file in FILES]),
+}
+"""The writer, the source, the turn from our world into one with the format's axis up, and names."""
 
 
-@pytest.mark.parametrize(("kind", "turn"), FORMATS)
-def test_known_cameras_come_back(tmp_path, kind, turn):
+@pytest.mark.parametrize("kind", FORMATS)
+def test_known_cameras_come_back(tmp_path, kind):
     K, poses = written.scene()
-    source, images = write(kind, tmp_path, K, written.in_source(poses, 0.01, turn))
+    writer, name, turn, names = FORMATS[kind]
+    source, images = rig(tmp_path, writer, name, K, written.in_source(poses, 0.01, turn), names)
+    written.write_photos(images, COLMAP_FILES if kind == "colmap" else FILES)
+    source = tmp_path / "model" if kind == "colmap" else source
     report = import_cameras(source, images, tmp_path / "out", scale=0.01)
     assert error_of(tmp_path / "out", K, poses) < PIXELS
     assert report.warnings == ()
@@ -90,7 +76,7 @@ def test_any_axis_can_be_up(tmp_path, up):
     turn[(axis + 1) % 3, 2] = 1.0
     turn[(axis + 2) % 3, 0] = sign
     assert np.linalg.det(turn) == pytest.approx(1)
-    source, images = write("full", tmp_path, K, written.in_source(poses, turn=turn))
+    source, images = rig(tmp_path, written.write_calibration_full, "rig.json", K, written.in_source(poses, turn=turn))
     report = import_cameras(source, images, tmp_path / "out", up=up)
     assert report.warnings == ()
     views = views_of(tmp_path / "out")
@@ -113,9 +99,8 @@ def test_the_example_of_the_docs_is_a_calibration(tmp_path):
 
 def test_easymocap_with_three_decimals(tmp_path):
     K, poses = written.scene()
-    written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=3)
-    written.write_photos(tmp_path / "photos", FILES)
-    import_cameras(tmp_path / "cams" / "intri.yml", tmp_path / "photos", tmp_path / "out", up="+y")
+    source, images = rig(tmp_path, written.write_easymocap, "cams", K, poses, decimals=3)
+    import_cameras(source / "intri.yml", images, tmp_path / "out", up="+y")
     assert error_of(tmp_path / "out", K, poses) < 0.1  # 5e-4 of rounding times a focal length of 70 px
     for view in views_of(tmp_path / "out"):
         r = np.asarray(view["cam_from_world"])[:3, :3]
@@ -124,13 +109,12 @@ def test_easymocap_with_three_decimals(tmp_path):
 
 def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
     K, poses = written.scene()
-    written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=9)
+    written.write_easymocap(tmp_path / "cams", K, poses, NAMES)
     for file in (tmp_path / "cams").iterdir():
         text = file.read_text().replace(f"_{NAMES[0]}:", "_1:").replace(f"_{NAMES[1]}:", "_a_1:")
         file.write_text(text.replace(f'"{NAMES[0]}"', '"1"').replace(f'"{NAMES[1]}"', '"a_1"'))
-    intri = tmp_path / "cams" / "intri.yml"
-    kept = [line for line in intri.read_text().splitlines()]
-    intri.write_text("\n".join([*kept, "dist_a_1: [0.2, 0.0, 0.0, 0.0, 0.0]", ""]))
+    with open(tmp_path / "cams" / "intri.yml", "a") as intri:
+        intri.write("dist_a_1: [0.2, 0.0, 0.0, 0.0, 0.0]\n")
     cameras = {camera.name: camera for camera in read_calibration(tmp_path / "cams", lambda name: (0, 0)).cameras}
     assert cameras["1"].distortion is None
     assert cameras["a_1"].distortion is not None and cameras["a_1"].distortion[0] == 0.2
@@ -139,11 +123,9 @@ def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
 
 def test_rotation_vectors_are_read_where_there_is_no_matrix(tmp_path):
     K, poses = written.scene()
-    written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=9)
-    extri = tmp_path / "cams" / "extri.yml"
-    extri.write_text(extri.read_text().replace("Rot_", "Unused_"))
-    written.write_photos(tmp_path / "photos", FILES)
-    import_cameras(tmp_path / "cams", tmp_path / "photos", tmp_path / "out", up="+y")
+    source, images = rig(tmp_path, written.write_easymocap, "cams", K, poses)
+    (source / "extri.yml").write_text((source / "extri.yml").read_text().replace("Rot_", "Unused_"))
+    import_cameras(source, images, tmp_path / "out", up="+y")
     assert error_of(tmp_path / "out", K, poses) < PIXELS
 
 
@@ -155,15 +137,14 @@ def test_colmap_points_are_reprojected(tmp_path):
     for k, pose in zip(K, poses, strict=True):
         plane = (written.project(k, pose, p) - k[:2, 2]) / k[0, 0]
         seen.append(plane * (1 + k1 * (plane**2).sum(-1, keepdims=True)) * k[0, 0] + k[:2, 2])
-    names = FILES
-    written.write_colmap(tmp_path / "model", K, poses, names, "SIMPLE_RADIAL", [k1], seen, p)
-    written.write_photos(tmp_path / "photos", names)
-    report = import_cameras(tmp_path / "model", tmp_path / "photos", tmp_path / "out", up="+y")
+    lens = {"model": "SIMPLE_RADIAL", "extra": [k1], "world_points": p}
+    source, images = rig(tmp_path, written.write_colmap, "model", K, poses, FILES, seen=seen, **lens)
+    report = import_cameras(source, images, tmp_path / "out", up="+y")
     assert report.checks.reprojection is not None and report.checks.reprojection < 1e-9
     assert report.checks.observations == 4 * len(p)
     assert report.undistorted == 4 and "lens distortion removed from 4 photos" in str(report)
-    written.write_colmap(tmp_path / "model", K, poses, names, "SIMPLE_RADIAL", [k1], [s + np.asarray([3, 0]) for s in seen], p)
-    report = import_cameras(tmp_path / "model", tmp_path / "photos", tmp_path / "out", up="+y", overwrite=True)
+    written.write_colmap(source, K, poses, FILES, seen=[np.add(pixels, [3, 0]) for pixels in seen], **lens)
+    report = import_cameras(source, images, tmp_path / "out", up="+y", overwrite=True)
     assert report.checks.reprojection == pytest.approx(3)
     assert "mean reprojection error is 3 px" in report.warnings[0]
 
@@ -183,7 +164,7 @@ def test_nerf_with_field_of_view_only(tmp_path):
 
 def test_pixel_centers_can_be_overridden(tmp_path):
     K, poses = written.scene()
-    source, images = write("full", tmp_path, K, poses)
+    source, images = rig(tmp_path, written.write_calibration_full, "rig.json", K, poses)
     import_cameras(source, images, tmp_path / "out", up="+y", pixel_centers="half")
     assert error_of(tmp_path / "out", written.integer_centers(K), poses) < PIXELS
 
@@ -256,12 +237,10 @@ def test_faults_of_file_storage_name_the_line(text, problem):
 
 
 def colmap(tmp_path, cameras=None, images=None):
-    folder = tmp_path / "model"
-    written.write_colmap(folder, *written.scene(), FILES)
+    folder, _ = rig(tmp_path, written.write_colmap, "model", *written.scene(), FILES)
     for name, edit in (("cameras.txt", cameras), ("images.txt", images)):
         if edit is not None:
             (folder / name).write_text(edit((folder / name).read_text()))
-    written.write_photos(tmp_path / "photos", FILES)
     return folder
 
 
@@ -303,11 +282,10 @@ def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, probl
     ],
 )
 def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
-    written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES)
-    edit_json(tmp_path / "transforms.json", edit)
-    written.write_photos(tmp_path / "photos", FILES)
+    source, images = rig(tmp_path, written.write_transforms, "transforms.json", *written.scene(), FILES)
+    edit_json(source, edit)
     with pytest.raises(CaptureError, match=problem):
-        import_cameras(tmp_path / "transforms.json", tmp_path / "photos", tmp_path / "out")
+        import_cameras(source, images, tmp_path / "out")
 
 
 def at_moments(tmp_path, keys, poses=None):
@@ -322,11 +300,7 @@ def at_moments(tmp_path, keys, poses=None):
 
 
 ALL = range(6)
-
-
 FLOAT_TIMES = [0.1 + 0.2, 0.3, 0.3, 1 / 3, 0.33333333, 0.3333333333]
-
-
 MOMENTS = {
     "VHAP": ([{"timestep_index": i // 3, "camera_index": i % 3} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
     "sparse steps, mixed up": ([{"timestep_index": (9, 3)[i // 3]} for i in ALL], None, 3, [1, 1, 1, 0, 0, 0]),

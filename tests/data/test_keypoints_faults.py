@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from changes import changed, edit_bytes
+from changes import changed
 
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.reading import read_keypoints
@@ -149,11 +149,8 @@ def test_a_person_can_be_chosen(tmp_path):
 FAULTS = {
     "no JSON": ("{,", r"line 1: not valid JSON"),
     "no keypoints": ({"cameras": []}, r"no keypoints: expected those of humangs detect; OpenPose; "),
-    "a number": (3, r"no keypoints: expected"),
-    "a list of numbers": ([1, 2], r"no keypoints: expected"),
     "empty list": ([], r"nobody in any of its images"),
     "empty": ("", r"not valid JSON"),
-    "nobody": ({"version": 1.3, "people": []}, r"nobody in any of its images"),
     "another": (
         [entry(count=27)],
         r"keypoints: expected 17 \(coco17\) or 26 \(halpe26\) or 133 \(wholebody133\) or 136 \(halpe136\) points, got 27",
@@ -161,23 +158,17 @@ FAULTS = {
     "two sets": ([entry(), entry("back", count=133)], r"image back: a person of 133 points, but another has 17"),
     "no triples": ([{"image_id": "front", "keypoints": [1.0] * 50}], r"\[0\]\.keypoints: expected a flat list of"),
     "text": ([with_number(0, "1")], r"\[0\]\.keypoints: expected numbers"),
-    "nested": ([{"image_id": "front", "keypoints": [[1, 2, 3], [4]]}], r"\[0\]\.keypoints: expected numbers"),
-    "lacks points": ([entry(), {"image_id": "back"}], r"\[1\]\.keypoints: missing"),
     "lacks image": ([entry(), {"keypoints": [1]}], r"\[1\]\.image_id: expected the name or number of an image"),
     "other views": ([entry("x.jpg"), entry("y")], r"images x\.jpg, y are none of the views front, back"),
     "percent": ([entry(confidence=80.0)], r"view front: expected confidences in \[0, 1\], got 80 to 80"),
-    "logits": ([with_number(2, -7.5)], r"view front: expected confidences in \[0, 1\], got -7\.5"),
     "all zero": ([entry(confidence=0.0)], r"no point has a confidence above 0"),
     "other photos": ([entry(shift=9000)], r"no point has a confidence above 0 \(not finite: 0, far outside .* 17\)"),
     "same image twice": ([entry("front.jpg"), entry("front.png")], r"'front\.jpg' and 'front\.png' are both for view"),
     "size": (annotations((640, 480)), r"size of front\.png: 640 x 480, but the capture's photos have 320 x 240"),
     "unknown image": (annotations(image_id=4), r"annotations\[0\]\.image_id: expected the id of one of the images, got 4"),
     "visibility": (annotations(keypoints=[9.0, 9.0, 3.0] * 17), r"expected visibilities 0, 1 or 2, got 3"),
-    "no images": ({"annotations": []}, r"images: missing"),
     "scores": ([{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}], r"keypoint_scores: expected shape \(17,\), got \(1,\)"),
-    "flat instance": ([{"keypoints": [1.0] * 34, "keypoint_scores": [1.0] * 17}], r"keypoints: expected shape \(any, 2\)"),
     "frame": ([{"frame_id": "a", "instances": []}], r"\[0\]\.frame_id: expected an integer, got 'a'"),
-    "no instances": ([{"frame_id": 0}], r"\[0\]\.instances: missing"),
     "openpose coco": (
         {"people": [{"pose_keypoints_2d": [1.0] * 54}]},
         r"people\[0\]\.pose_keypoints_2d: expected a flat list of 75 ",
@@ -186,7 +177,6 @@ FAULTS = {
         {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": [1.0] * 60}]},
         r"people\[0\]\.hand_left_keypoints_2d: expected a flat list of 63 \(21 times x, y, confidence\)",
     ),
-    "openpose pose": ({"people": [{}]}, r"people\[0\]\.pose_keypoints_2d: missing"),
 }
 
 
@@ -235,17 +225,9 @@ OWN = {"points": np.ones((2, 17, 2)), "confidences": np.ones((2, 17)), "set": np
         ),
         ({"points": np.ones((2, 133, 2))}, r"points: expected shape \(2, 17, 2\), got \(2, 133, 2\)"),
         ({"confidences": np.ones((1, 17))}, r"confidences: expected shape \(2, 17\)"),
-        ({"points": np.full((2, 17, 2), "a")}, r"points: expected real numbers"),
     ],
 )
 def test_our_own_file_damaged(tmp_path, change, message):
     np.savez(tmp_path / "k.npz", **changed(OWN, change))
     with pytest.raises(CaptureError, match=rf"k\.npz: {message}"):
-        read_keypoints(tmp_path / "k.npz", NAMES, *SIZE)
-
-
-def test_our_own_file_cut_off(tmp_path):
-    np.savez(tmp_path / "k.npz", **OWN)
-    edit_bytes(tmp_path / "k.npz", lambda data: data[:300])
-    with pytest.raises(CaptureError, match=r"k\.npz: not a readable npz archive"):
         read_keypoints(tmp_path / "k.npz", NAMES, *SIZE)

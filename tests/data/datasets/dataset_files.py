@@ -1,6 +1,7 @@
 """Tiny data sets in every layout, from random numbers: nobody would recognise a person, but every file is as it should be."""
 
 import csv
+import io
 import json
 import pickle
 
@@ -135,10 +136,10 @@ def cameras():
     return poses, np.asarray([[20.0, 0, 5.5], [0, 20, 7.5], [0, 0, 1]])
 
 
-def write_photo(photo, mask, level=100):
+def write_photo(photo, mask):
     for path in (photo, mask):
         path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.full((HEIGHT, WIDTH, 3), level, np.uint8)).save(photo, quality=95)
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 100, np.uint8)).save(photo, quality=95)
     person = np.zeros((HEIGHT, WIDTH), np.uint8)
     person[4:12, 3:9] = 255
     Image.fromarray(person).save(mask, quality=95)
@@ -159,26 +160,24 @@ def calibration(names):
     return {n: {"K": flat(K), "R": flat(R), "T": flat(T), "imgSize": size} for n, (R, T) in zip(names, poses, strict=True)}
 
 
-def write_avatarrex(folder, frames=FRAMES):
-    names = ["22010708", "22010710"]
+def write_folders(folder, names, photos, masks, rig, frames):
+    """Videos as photos in folders; `photos` and `masks` name those of a camera."""
     for name in names:
         for frame in range(frames):
             file = f"{frame:08d}.jpg"
-            write_photo(folder / name / file, folder / name / "mask" / "pha" / file, 100 + frame)
-    (folder / "calibration_full.json").write_text(json.dumps(calibration(names)))
+            write_photo(folder / photos.format(name) / file, folder / masks.format(name) / file)
+    (folder / rig).write_text(json.dumps(calibration(names)))
     np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
     return folder
 
 
+def write_avatarrex(folder, frames=FRAMES):
+    return write_folders(folder, ["22010708", "22010710"], "{}", "{}/mask/pha", "calibration_full.json", frames)
+
+
 def write_thuman4(folder, frames=FRAMES):
-    names = ["cam00", "cam01"]
-    for name in names:
-        for frame in range(frames):
-            file = f"{frame:08d}.jpg"
-            write_photo(folder / "images" / name / file, folder / "masks" / name / file)
-    (folder / "calibration.json").write_text(json.dumps(calibration(names)))
+    write_folders(folder, ["cam00", "cam01"], "images/{}", "masks/{}", "calibration.json", frames)
     (folder / "missing_img_files.txt").write_text("images\\cam01\\00000001.jpg\n")
-    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
     return folder
 
 
@@ -209,14 +208,17 @@ def h5py():
 
 
 def write_dna(folder, frames=FRAMES):
-    import io
-
     import h5py
 
     poses, K = cameras()
     for part in ("main", "annotations"):
         (folder / part).mkdir(parents=True)
-    encode = lambda pixels: np.frombuffer(encoded(pixels, io.BytesIO()), np.uint8)
+
+    def encode(pixels):
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "PNG")
+        return np.frombuffer(stream.getvalue(), np.uint8)
+
     person = np.zeros((HEIGHT, WIDTH), np.uint8)
     person[4:12, 3:9] = 255
     values = parameter_arrays(frames=frames)
@@ -238,11 +240,6 @@ def write_dna(folder, frames=FRAMES):
         for key in ("betas", "expression"):
             notes[f"SMPLx/{key}"] = values[key]
     return folder
-
-
-def encoded(pixels, stream):
-    Image.fromarray(pixels).save(stream, "PNG")
-    return stream.getvalue()
 
 
 # Scene list -----------------------------------------------------------------------------------------------------------
