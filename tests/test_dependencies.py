@@ -1,28 +1,24 @@
 """pyproject.toml declares what the package and its tests import, and no dependency that the package does not import."""
 
-import ast
 import re
 import sys
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+IMPORT = re.compile(r"^\s*(?:from (\w+)[\w.]* import \w|import (\w+)(?:\.\w+)*(?: as \w+)?(?:  #.*)?$)", re.MULTILINE)
 OURS = {"humangs_jax", "tests", "experiments"}
 NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax", "yaml": "PyYAML"}
 """Distributions that are not called like their module."""
-UNTESTED = {"torch"}
-"""Imported by scripts in tests/ that made stored references, not by tests."""
+UNTESTED = {"torch", "bpy"}
+"""Imported by scripts that made stored references, and by those that Blender runs."""
 
 
 def imported(folder):
     """Distributions of all modules that the files of a folder import, also inside of functions."""
     found = set()
     for file in folder.rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-                found.add(node.module.split(".")[0])
+        found |= {first or second for first, second in IMPORT.findall(file.read_text())}
     return {plain(NAMES.get(module, module)) for module in found - sys.stdlib_module_names - OURS}
 
 

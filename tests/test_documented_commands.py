@@ -1,15 +1,12 @@
 """Every `humangs` and `python` line of README, docs and notebooks is one that the real parser takes; quick ones are run."""
 
 import contextlib
-import functools
 import importlib
 import io
 import json
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +20,7 @@ from experiments.harness import listed, parser_of
 from humangs_jax import cli
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
-from humangs_jax.cli.options import UsageError
+from humangs_jax.cli.options import UsageError, option_names
 from humangs_jax.data.capture import load_capture, save_capture
 
 ROOT = Path(__file__).parents[1]
@@ -44,9 +41,7 @@ PROGRAM = re.compile(r"(?:.*/)?(humangs|python3?)$")
 
 
 class Command(NamedTuple):
-    """words: without prompt, program before it, placeholders as they stand. whole: nothing is missing; so are those of blocks and
-    those that begin an item of a list.
-    """
+    """words: without prompt and program before it, placeholders as they stand. whole: of a block; others may lack arguments."""
 
     page: str
     words: tuple[str, ...]
@@ -78,10 +73,8 @@ def commands_in(text, page):
     for block in FENCE.finditer(text):
         if block["kind"].lower() in SHELLS:
             found += [Command(page, words, True) for words in split_shell(block["text"])]
-    prose = FENCE.sub("", text)
-    for span in SPAN.finditer(prose):
-        item = prose[: span.start()].endswith(("\n- ", "\n* "))
-        found += [Command(page, words, item) for words in split_shell(" ".join(span["text"].split()))]
+    for span in SPAN.finditer(FENCE.sub("", text)):
+        found += [Command(page, words, False) for words in split_shell(" ".join(span["text"].split()))]
     return list(dict.fromkeys(found))
 
 
@@ -119,17 +112,9 @@ def of_one(words):
 
 
 def filled(words):
-    """Optional parts as if they were given, the first of several values, 1 for what is in capitals or is a variable."""
-    kept = []
-    for word in words:
-        word = word.replace("[", "").replace("]", "")
-        if re.fullmatch(r"[\w.+-]+(\|[\w.+-]+)+", word):
-            word = word.split("|")[0]
-        word = re.sub(r"\$\{?\w+\}?", "1", word)
-        word = re.sub(r"(?<![\w.])[A-Z][A-Z_]*(?![\w.])", "1", word)
-        if word and word not in ("...", "…"):
-            kept.append(word)
-    return kept
+    """Optional parts as if they were given, the first of several values, and 1 for what is in capitals or is a variable."""
+    words = [word.strip("[]").split("|")[0] for word in words if word not in ("...", "…")]
+    return [re.sub(r"\$\{?\w+\}?|(?<![\w.])[A-Z][A-Z_]*(?![\w.])", "1", word) for word in words]
 
 
 # The tests ----------------------------------------------------------------------------------------------------------------
@@ -137,9 +122,6 @@ def filled(words):
 
 COMMANDS = [command for page in PAGES for command in commands_of(page)]
 OURS = [command for command in COMMANDS if command.words[0] == "humangs" and len(command.words) > 1]
-SCRIPTS = [command for command in COMMANDS if command.words[0] == "python" and command.words[1:2] != ("-m",)]
-FOREIGN = ("demo/inferencer_demo.py",)
-"""Scripts of other projects that pages name."""
 QUICK = (
     "export avatar.npz --out person.ply",
     "export avatar.npz --out person.spz --motion dance.bvh --frame 40",
@@ -160,58 +142,18 @@ SLOW = (
     "evaluate me --avatar avatar.npz --protocol lhm",
 )
 """And on the demo's photos, in this order: the first ones make what the others read."""
-MORE = (
-    [],
-    ["1"],
-    ["--out", "1"],
-    ["1", "--out", "1"],
-    ["1", "1"],
-    ["1", "1", "--out", "1"],
-    ["1", "--images", "1", "--out", "1"],
-)
-"""What may be missing in the middle of a sentence."""
-
-PARSE = """
-import argparse, contextlib, functools, io, json, os, runpy, sys
-class Parsed(BaseException): pass
-original = argparse.ArgumentParser.parse_args
-def parse(self, args=None, namespace=None):
-    original(self, args, namespace)
-    raise Parsed
-argparse.ArgumentParser.parse_args = parse
-import tyro
-real = tyro.cli
-def typed(function, *given, **named):
-    def stub(*_, **__):
-        raise Parsed
-    return real(functools.update_wrapper(stub, function), *given, **named)  # it would call the function
-tyro.cli = typed
-problems = []
-for script, *arguments in json.load(sys.stdin):
-    printed, path = io.StringIO(), list(sys.path)
-    sys.argv = [script, *arguments]
-    sys.path.insert(0, os.path.dirname(script))
-    try:
-        with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
-            runpy.run_path(script, run_name="__main__")
-        problems.append("it ran without parsing its options")
-    except Parsed:
-        problems.append(None)
-    except SystemExit:
-        problems.append(printed.getvalue()[-600:])
-    sys.path[:] = path
-json.dump(problems, sys.__stdout__)
-"""
 
 
-@functools.cache
-def parsed(*words):
-    """None, or what the parser of `humangs` says."""
+def refused(command):
+    """None, or why a line of a page cannot be typed: what the parser says; of a span, a name or an option that does not exist."""
+    name, *words = filled(command.words[1:])
+    if not command.whole:
+        known = option_names(cli._command(name)) if name in cli.COMMANDS else ()
+        return [word for word in words if word.startswith("--") and word.split("=")[0] not in known] or None
     printed = io.StringIO()
-    words = [word for word in words if word not in ("--quiet", "--verbose", "--version")]
     try:
         with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
-            cli._parsed(words)
+            cli._parsed([name, *words])
     except SystemExit as exit_:
         return None if exit_.code in (0, None) else printed.getvalue()
     except UsageError as error:
@@ -219,45 +161,15 @@ def parsed(*words):
     return None
 
 
-def refused(command):
-    """None, or why a line of a page cannot be typed."""
-    words = filled(command.words[1:])
-    if command.whole:
-        return parsed(*words)
-    lines = [words]
-    if words[-1].startswith("--"):  # it may be named without its value
-        lines.append([*words[:-1], f"{words[-1]}=1"])
-    tried = (parsed(*line, *more) for line in lines for more in MORE)
-    return None if None in tried else parsed(*words)
-
-
 @pytest.mark.parametrize("command", OURS, ids=str)
 def test_a_documented_command_is_one_that_the_parser_takes(command):
     assert refused(command) is None, f"{command}\n{refused(command)}"
 
 
-def wrong_scripts(commands, folder):
-    """Lines whose script does not take its options, and what it says: all are asked in one process."""
-    given = [[str(ROOT / command.words[1]), *filled(command.words[2:])] for command in commands]
-    run = [sys.executable, "-c", PARSE]
-    done = subprocess.run(run, input=json.dumps(given), capture_output=True, text=True, cwd=folder, check=False)
-    assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    return [f"{command}\n{problem}" for command, problem in zip(commands, said, strict=True) if problem]
-
-
-def with_options():
-    """Lines of scripts with a parser, but names without options in the middle of a sentence."""
-    found = [x for x in SCRIPTS if x.words[1] not in FOREIGN and (x.whole or len(x.words) > 2)]
-    return [x for x in found if "parse_args" in (text := (ROOT / x.words[1]).read_text()) or "import tyro" in text]
-
-
-def test_documented_scripts_exist_and_take_their_options(tmp_path):
-    ours = [command for command in SCRIPTS if command.words[1] not in FOREIGN]
-    assert [str(command) for command in ours if not (ROOT / command.words[1]).is_file()] == []
-    asked = with_options()
-    assert asked and wrong_scripts(asked, tmp_path) == []
-    assert list(tmp_path.iterdir()) == []  # none has begun its work
+def test_documented_scripts_and_tests_exist():
+    scripts = [words[1] for _, words, _ in COMMANDS if words[0] == "python" and words[1:2] != ("-m",)]
+    tests = [word for _, words, _ in COMMANDS if words[1:3] == ("-m", "pytest") for word in words if word.startswith("tests/")]
+    assert scripts and tests and [name for name in (*scripts, *tests) if not (ROOT / name).exists()] == []
 
 
 def test_documented_experiments_exist_and_take_their_options():
@@ -269,22 +181,8 @@ def test_documented_experiments_exist_and_take_their_options():
             parser_of(getattr(importlib.import_module(known[name][0]), name))[0].parse_args(filled(options))
 
 
-def test_documented_runs_of_the_tests_name_what_exists():
-    runs = [command for command in COMMANDS if command.words[1:3] == ("-m", "pytest")]
-    named = [word for command in runs for word in command.words if word.startswith("tests/")]
-    assert runs and [word for word in named if not (ROOT / word).exists()] == []
-
-
-def test_the_collection_misses_no_line_that_names_a_command():
-    for page in PAGES:
-        text = page.read_text()
-        if page.suffix == ".md":
-            lines = [line for block in FENCE.finditer(text) for line in block["text"].splitlines()]
-            found = {" ".join(command.words[:2]) for command in commands_of(page)}
-            for line in lines:
-                for name in cli.COMMANDS:
-                    assert not line.startswith(f"humangs {name}") or f"humangs {name}" in found, line
-    assert {command.words[1] for command in OURS} >= set(cli.COMMANDS)  # every command is shown somewhere
+def test_every_command_is_shown_somewhere():
+    assert {command.words[1] for command in OURS} >= set(cli.COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -312,14 +210,13 @@ def test_blocks_are_whole_and_spans_are_not():
         Command("page", ("humangs", "view", "x"), True),
         Command("page", ("humangs", "fit", "me", "--scan", "S"), False),
     ]
-    words = ["import", "cameras", "SOURCE", "[--scale", "S]", "[--up=+z]", "integer|half", "$A/x.npz", "..."]
-    assert filled(words) == ["import", "cameras", "1", "--scale", "1", "--up=+z", "integer", "1/x.npz"]
+    assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == ["1", "--up=+z", "integer", "1/x.npz"]
 
 
 @pytest.mark.parametrize("words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos"])
 def test_a_wrong_line_is_noticed(words):
-    command = Command("page", ("humangs", *words.split()), True)
-    assert refused(command) is not None
+    assert refused(Command("page", ("humangs", *words.split()), True))
+    assert refused(Command("page", ("humangs", "train", "--vgg-19"), False))
 
 
 @pytest.fixture

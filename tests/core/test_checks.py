@@ -187,10 +187,11 @@ def test_errors_of_the_library_name_no_options():
     """They are the command line's, which shows the name of an argument as an option."""
     package, named, options = Path(hg.__file__).parent, [], set()
     for path in package.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if path.parent.name == "cli" and isinstance(node, ast.AnnAssign):
+        text, command = path.read_text(), path.parent.name == "cli"
+        for node in ast.walk(ast.parse(text)) if command or re.search(r"--[a-z]", text) else ():
+            if command and isinstance(node, ast.AnnAssign):
                 options.add(ast.unparse(node.target).replace("_", "-"))
-            elif path.parent.name != "cli" and isinstance(node, ast.Raise):
+            elif not command and isinstance(node, ast.Raise):
                 named += [(path.name, option) for option in re.findall(r"--([a-z-]+)", ast.unparse(node))]
     assert len(options) > 100 and not [(name, option) for name, option in named if option in options]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import pose_body, rest_pose, shape_body
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
@@ -96,12 +96,10 @@ def test_one_example_is_not_a_batch_but_it_is_there():
 
 
 def test_every_kind_of_batch_knows_its_axes():
-    body = load_body()
-    pose = rest_pose(body)
-    posed = pose_body(body, shape_body(body, jnp.zeros(2)), pose)
-    gaussians = Gaussians(*(jnp.ones(shape) for shape in ((5, 3), (5, 4), (5, 3), (5,), (5, 3))))
-    for one in (pose, posed, gaussians, Rendering(jnp.ones((2, 2, 3)), *[jnp.ones((2, 2))] * 2, jnp.int32(0))):
-        two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), one)
+    ones = lambda *shapes: [jnp.asarray(np.ones(shape, np.float32)) for shape in shapes]
+    gaussians = Gaussians(*ones((5, 3), (5, 4), (5, 3), 5, (5, 3)))
+    for one in (BodyPose(*ones((4, 3), 3)), gaussians, Rendering(*ones((2, 2, 3), (2, 2), (2, 2)), jnp.int32(0))):
+        two = jax.tree.map(lambda leaf: np.stack([leaf] * 2), one)
         assert one.batch_shape == () and two.batch_shape == (2,)
         assert jax.tree.structure(two[1]) == jax.tree.structure(one) and two[1].batch_shape == ()
 

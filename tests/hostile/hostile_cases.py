@@ -146,7 +146,10 @@ PLACES = {
     "a link to itself": lambda file: file.symlink_to(file),
     "of a terabyte": huge,
 }
-NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start", "splat"}
+NOT_NOTICED = {
+    *("log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start", "splat", "manifest"),
+    "easymocap motion",
+}
 """Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again. Zeros are
 Gaussians of a `.splat`, which has no header."""
 
