@@ -3,7 +3,6 @@ import functools
 import logging
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import time
@@ -19,7 +18,6 @@ from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import stage
-from humangs_jax.io.images import read_image
 
 COMMANDS = tuple(cli.COMMANDS)
 
@@ -31,77 +29,23 @@ def test_every_page_that_a_help_text_names_exists():
     assert len(pages) > 4 and all((docs / f"docs/{page}.md").is_file() for page in pages), pages
 
 
-def test_help_names_every_command_and_imports_nothing_heavy():
-    code = "import sys; from humangs_jax import cli; sys.argv = ['humangs', '--help']\ntry: cli.main()\nexcept SystemExit: pass\n"
-    code += "assert 'jax' not in sys.modules and 'flax' not in sys.modules"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert all(name in result.stdout for name in COMMANDS)
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command, humangs):
     code, out, _ = humangs(command, "--help")
     assert code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
     assert "None" not in out and "docs/" not in out
     lines = out.split("examples:\n")[1].splitlines()
-    assert len(lines) == len(set(lines)) == 2
+    assert 1 <= len(lines) == len(set(lines)) <= 2
     for line in lines:
         assert line.startswith(f"  humangs {command} ")
         cli._parsed(shlex.split(line)[1:])
+    shown = set(re.findall(r"^.? (--[a-z][\w-]*)", out, re.MULTILINE))  # with boxes or without
+    assert shown == options.option_names(cli._command(command))
 
 
-@pytest.mark.parametrize(
-    ("words", "usage"),
-    [("import cameras", "import cameras [-h] [OPTIONS] SOURCE"), ("import", "import [-h] [OPTIONS] {cameras}")],
-)
-def test_the_usage_of_an_import_can_be_typed_as_it_stands(words, usage, humangs):
-    _, out, _ = humangs(*words.split(), "--help")
-    assert out.startswith(f"usage: humangs {usage}")
-
-
-@pytest.mark.slow
-def test_from_photos_to_images(capture_folder, tmp_path, monkeypatch, humangs):
-    """reconstruct, render, animate, export and check, one after the other, as a user would."""
-    import plyfile
-
-    monkeypatch.chdir(tmp_path)
-    for arguments in (
-        ("reconstruct", capture_folder, "--out", "avatar.npz"),
-        ("refine", "avatar.npz", capture_folder, "--limit", "2steps", "--image-size", "64", "--live", "--out", "refined.npz"),
-        ("render", "refined.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
-        ("export", "avatar.npz", "--out", "avatar.ply"),
-        ("check", capture_folder, "--out", "check.png"),
-    ):
-        code, _, error = humangs(*arguments)
-        assert code == 0, error
-    image, _ = read_image("views/view_000.png")
-    assert image.shape == (64, 64, 3) and image.std() > 10 / 255 and image[0].min() == 1
-    assert Path("views/views.exr").stat().st_size > 1000
-    assert len(plyfile.PlyData.read("avatar.ply")["vertex"].data) > 10_000
-    assert read_image("check.png")[0].std() > 10 / 255
-
-
-def test_fit_deletes_no_folder_with_something_of_its_own_or_of_the_user(capture_folder, tmp_path, monkeypatch, humangs):
-    monkeypatch.chdir(tmp_path)
-    capture = Path("out/capture.json")
-    for name in ("docs/me.obj", "docs/scan_fit.json", "papers/thesis.tex", "out/k.json", capture):
-        Path(name).parent.mkdir(exist_ok=True)
-        Path(name).write_text("mine")
-    shutil.copyfile(capture_folder / "capture.json", capture)
-    before = sorted(tmp_path.rglob("*"))
-    for arguments, message in (
-        (("--scan", "docs/me.obj", "--out", "docs"), "docs/me.obj lies in it and would be deleted"),
-        (("--scan", "docs/me.obj", "--out", "papers"), "the folder holds no scan_fit.json"),
-        ((capture_folder, "--keypoints", "out/k.json", "--out", "papers"), "the folder holds no capture.json"),
-        ((capture_folder, "--keypoints", "out/k.json", "--out", "out"), "out/k.json lies in it and would be deleted"),
-        ((capture_folder, "--keypoints", "k", "--body", "out/k.json", "--out", "out"), "out/k.json lies in it"),
-    ):
-        code, _, error = humangs("fit", *arguments, "--overwrite")
-        assert code == 2 and message in error and error.count("\n") == 1, (arguments, error)
-    assert sorted(tmp_path.rglob("*")) == before
-    code, printed, _ = humangs("fit", "--scan", "none.obj", "--out", "docs", "--overwrite")
-    assert code == cli.BAD_DATA and "this is deleted: me.obj, scan_fit.json" in printed and sorted(tmp_path.rglob("*")) == before
+def test_the_usage_of_an_import_can_be_typed_as_it_stands(humangs):
+    _, out, _ = humangs("import", "cameras", "--help")
+    assert out.startswith("usage: humangs import cameras [-h] [OPTIONS] SOURCE")
 
 
 def test_the_options_of_each_way_to_fit_exist():
@@ -161,12 +105,6 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
 )
 def test_a_wrong_option_is_one_line_with_the_nearest(words, said, humangs):
     assert humangs(*words.split()) == (cli.BAD_USAGE, "", f"humangs: error: {said}\n")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_option_of_a_help_text_is_known(command, humangs):
-    shown = set(re.findall(r"^.? (--[a-z][\w-]*)", humangs(command, "--help")[1], re.MULTILINE))  # with boxes or without
-    assert shown == options.option_names(cli._command(command))
 
 
 def test_version_and_unknown_commands(humangs):
@@ -302,22 +240,13 @@ def test_a_reader_that_has_gone_ends_a_command_quietly(tmp_path):
     assert program.wait() == cli.BROKEN_PIPE and error == b""
 
 
-def test_the_logs_of_libraries_stay_off_the_screen():
-    """Orbax's warnings go through absl's logger; ours are shown."""
-    code = (
-        "from humangs_jax.cli.screen import silence; import logging, warnings; silence(False)\n"
-        "logging.getLogger('absl').warning('noise'); warnings.warn('noise')\n"
-        "logging.getLogger('humangs_jax.training').warning('ours')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == "humangs: ours\n"
-
-
 @pytest.mark.parametrize("verbose", [False, True])
-def test_errors_in_threads_of_libraries_stay_off_the_screen(verbose):
-    """TensorStore's have nobody to report to: `train` showed their tracebacks on a full disk. Those of ours are shown."""
+def test_what_libraries_say_stays_off_the_screen(verbose):
+    """Orbax's warnings go through absl's logger; errors in TensorStore's threads have nobody to report to. Ours are shown."""
     code = (
-        f"from humangs_jax.cli.screen import silence; import threading; silence({verbose})\n"
+        f"from humangs_jax.cli.screen import silence; import logging, threading, warnings; silence({verbose})\n"
+        "logging.getLogger('absl').warning('theirs'); warnings.warn('theirs')\n"
+        "logging.getLogger('humangs_jax.training').warning('ours')\n"
         "class Broken:\n"
         "    def __init__(self, name): self.name = name\n"
         "    def __del__(self): raise RuntimeError(self.name)\n"
@@ -325,11 +254,12 @@ def test_errors_in_threads_of_libraries_stay_off_the_screen(verbose):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ("theirs" in done.stderr) == verbose and "RuntimeError: ours" in done.stderr, done.stderr
+    assert verbose or done.stderr.startswith("humangs: ours\n")
 
 
-def test_places_are_checked_before_anything_heavy_is_imported(tmp_path):
+def test_help_and_checks_of_places_import_nothing_heavy(tmp_path):
     code = (
-        "import sys; from humangs_jax import cli\n"
+        "import sys; from humangs_jax import cli; print(cli.overview())\n"
         "for words in (['reconstruct', 'x', '--out', 'no/a.npz'], ['refine', 'x', 'y', '--out', 'no/a.npz'],"
         " ['check', 'x', '--out', 'a.npz'], ['convert', 'x', '--out', 'a.npz'], ['demo', '--size', '0'],"
         " ['synth', '--workers', '0'],"
@@ -342,3 +272,4 @@ def test_places_are_checked_before_anything_heavy_is_imported(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     assert len(done.stderr.splitlines()) == 13 and list(tmp_path.iterdir()) == []
+    assert all(name in done.stdout for name in COMMANDS)

@@ -1,9 +1,7 @@
 """Nothing that a file says acts on the terminal, and nothing but one module writes there."""
 
 import io
-import os
 import re
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -71,13 +69,6 @@ def test_any_name_can_be_said_on_any_terminal(encoding, monkeypatch):
     stream.seek(0)
     first, second = stream.buffer.getvalue().decode(encoding).splitlines()
     assert "\\xe9.png: 3 " in first and second == "second"
-
-
-def test_help_can_be_shown_on_an_ascii_terminal():
-    environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
-    command = [sys.executable, "-m", "humangs_jax.cli", "check", "--help"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout.isascii() and not done.stderr
 
 
 def lines_of(shown):
