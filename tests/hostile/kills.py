@@ -1,9 +1,9 @@
 """Kills every command that writes at random moments: python kills.py FOLDER [--count 10] [--json FILE] [COMMAND ...]
 Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts [--count 100] [--json FILE] [COMMAND ...]
 
-A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, some time after one, or at
-any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
-disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
+A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, or at any time. Then no file
+under a final name may be half-written or lost, and the next run has to make what a run that nobody disturbed makes, and to remove
+what the killed one left. See `writers` for what the commands compute meanwhile.
 
 A run that is interrupted, at any time, has to exit with 130 and one line, and to leave nothing half-written and no temporary name
 itself; after the last of them the next run has to work.
@@ -24,25 +24,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 import writers
 from writers import COMMANDS, Command, Moment
 
-LONGEST = 1.0
-"""Seconds after a change of a file at which a run is killed, at most."""
 INTERRUPTED = 130
 """The exit status of a command that was interrupted."""
-BEFORE, AFTER = 0.45, 0.85
-"""Shares of the moments just before a change, and up to some time after one; the rest is at any time."""
 
 
 def some_moment(changes: list, generator: random.Random, interrupt: bool) -> Moment:
-    times = [when for when, *_ in changes]
-    at, kind = generator.randrange(len(times)), generator.random()
+    seconds = generator.uniform(0, changes[-1][0])
     if interrupt:
-        return Moment(None, generator.uniform(0, times[-1]), signal.SIGINT)
-    if kind < BEFORE:
-        return Moment(at, 0.0)
-    if kind < AFTER:
-        gap = (times[at + 1] if at + 1 < len(times) else times[-1] + 0.1) - times[at]
-        return Moment(at, generator.uniform(1e-6, min(gap, LONGEST)))
-    return Moment(None, generator.uniform(0, times[-1]))
+        return Moment(seconds=seconds, by=signal.SIGINT)
+    return Moment(event=generator.randrange(len(changes))) if generator.random() < 0.5 else Moment(seconds=seconds)
 
 
 def run_undisturbed(command: Command, place: Path, kept: Path, inputs: Path) -> tuple[dict, writers.Run, dict]:

@@ -23,8 +23,8 @@ from humangs_jax.detection.people import detect_people
 from humangs_jax.io.images import read_grey, resized, to_uint8
 
 HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
-FLAG_TURNED, FLAG_MIRRORED = 6, 2
-"""EXIF orientations."""
+TURNED = 6
+"""EXIF orientation."""
 CAPTURE = load_capture("demo_capture")
 
 
@@ -45,9 +45,9 @@ def save(folder, name, photo, **options):
     (picture.convert(mode) if mode else picture).save(folder / name, **options)
 
 
-def good(folder, count=2, suffix="png"):
+def good(folder, count=2):
     for i in range(count):
-        save(folder, f"good{i}.{suffix}", view(i % CAPTURE.view_count)[0])
+        save(folder, f"good{i}.png", view(i % CAPTURE.view_count)[0])
 
 
 def one(change, name="odd.png", **options):
@@ -60,7 +60,7 @@ def one(change, name="odd.png", **options):
     return make
 
 
-def beside(scales, recolored=False):
+def beside(scales):
     """People side by side, each of a share of the height."""
 
     def make(folder):
@@ -69,7 +69,6 @@ def beside(scales, recolored=False):
             for k, scale in enumerate(scales):
                 size = round(384 * scale)
                 person, mask = view(i, size)
-                person = person[..., ::-1] if recolored and k else person
                 part = photo[384 - size :, 384 * k : 384 * k + size]
                 part += mask[..., None] * (person - part)
             save(folder, f"both{i}.png", photo)
@@ -118,12 +117,6 @@ def files(**contents):
     return make
 
 
-def exif(flag):
-    tags = Image.Exif()
-    tags[0x0112] = flag
-    return tags
-
-
 def jpeg():
     stream = io.BytesIO()
     Image.fromarray(to_uint8(view(0)[0])).save(stream, "JPEG")
@@ -147,58 +140,45 @@ def duplicates(folder):
     shutil.copy(folder / "good0.png", folder / "good0 (1).png")
 
 
-def forty(folder):
-    good(folder, 40)
-
-
 def nested(folder):
     good(folder / "images" / "left")
     good(folder / "images" / "right")
 
 
+TURNED_BY_EXIF = Image.Exif()
+TURNED_BY_EXIF[0x0112] = TURNED
 OUTSIDE = r"warning: odd\.png: a part of the person is outside of the photo"
 NOBODY = r"warning: odd\.png: the person was not found in it"
 FOLDERS = {
     # a result
     "good": (good, 2, ""),
     "one photo": (lambda folder: good(folder, 1), 1, ""),
-    "40 photos": (forty, 40, ""),
-    "JPEG": (lambda folder: good(folder, 2, "jpg"), 2, ""),
+    "40 photos": (lambda folder: good(folder, 40), 40, ""),
     "a folder for each camera": (nested, 4, ""),
     "the same photo twice": (duplicates, 3, ""),
     "a statue": (one(grey), 3, ""),
-    "grey": (one(grey, mode="L"), 3, ""),
-    "alpha": (one(lambda photo: photo, mode="RGBA"), 3, ""),
-    "a palette": (one(lambda photo: photo, mode="P"), 3, ""),
     "CMYK": (one(lambda photo: photo, "odd.jpg", mode="CMYK"), 3, ""),
     "animated": (animated, 3, ""),
-    "turned by EXIF": (one(lambda photo: np.rot90(photo), exif=exif(FLAG_TURNED)), 3, ""),
-    "mirrored by EXIF": (one(lambda photo: photo[:, ::-1], "odd.jpg", exif=exif(FLAG_MIRRORED)), 3, ""),
+    "turned by EXIF": (one(lambda photo: np.rot90(photo), exif=TURNED_BY_EXIF), 3, ""),
     "mirrored": (one(lambda photo: photo[:, ::-1]), 3, ""),
     "upside down": (one(lambda photo: photo[::-1, ::-1]), 3, ""),
     "on its side": (one(np.rot90), 3, ""),
     "mixed sizes": (one(lambda photo: resized(photo, 600, 600)), 3, ""),
     "behind a table": (one(behind_a_table), 3, ""),
-    "a panorama": (one(far(1600, 420, 200)), 3, ""),
     "far away": (one(far(1000, 1000, 120)), 3, ""),
     "somebody small beside": (beside((1.0, 0.4)), 2, ""),
-    "text files beside": (files(notes_txt=b"hello", data_json=b"{}"), 2, ""),
     "another format under this name": (files(odd_png=jpeg()), 3, ""),
     # a warning that names the photo
     "feet cut off": (one(lambda photo: photo[:300]), 3, OUTSIDE),
     "cut at one side": (one(lambda photo: photo[:, 160:]), 3, OUTSIDE),
     "an empty room among them": (one(lambda photo: room()), 3, NOBODY),
-    "a black photo among them": (one(np.zeros_like), 3, NOBODY),
     "a speck": (one(far(1000, 1000, 30)), 3, NOBODY),
-    "one pixel": (one(lambda photo: photo[:1, :1]), 3, NOBODY),
     # one clear line
-    "no person": (only(room=room()), None, r"no person in room\.png: expected one"),
     "black": (only(dark=np.zeros((64, 48, 3))), None, r"no person in dark\.png: expected one"),
     "tiny photos": (only(a=room(8, 8), b=room(1, 1)), None, r"no person in a\.png, b\.png: expected one"),
     "two people": (beside((1.0, 0.9)), None, r"2 people in both0\.png, both1\.png: expected one\. Person 0 to 1"),
     "a photo cut short": (files(odd_jpg=jpeg()[:2000]), None, r"odd\.jpg"),
     "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),
-    "text under a photo's name": (files(odd_jpg=b"<html>404</html>"), None, r"odd\.jpg"),
     "a HEIC without the extra": (files(odd_heic=HEIC.read_bytes()), None, r"odd\.heic.*heic"),
     "one name with two suffixes": (one(lambda photo: photo, "good0.jpg"), None, r"good0\.jpg and .*good0\.png"),
     "a video": (video, None, "no photo: expected"),
@@ -206,7 +186,7 @@ FOLDERS = {
     "nothing": (lambda folder: folder.mkdir(), None, "no photo: expected"),
     "a folder that is not there": (lambda folder: None, None, "no such folder"),
 }  # fmt: skip
-FAST = ("good", "black", "one name with two suffixes", "a HEIC without the extra", "a photo cut short", "feet cut off", "nothing")
+FAST = ("black", "one name with two suffixes", "a HEIC without the extra", "a photo cut short", "feet cut off", "nothing")
 
 
 @pytest.fixture(scope="module")
@@ -260,7 +240,7 @@ def test_the_person_is_found_or_one_line_says_why_not(kind, remembered, tmp_path
 HOPELESS = [kind for kind, (_, count, _) in FOLDERS.items() if count is None and kind != "one name with two suffixes"]
 
 
-@pytest.mark.parametrize("kind", kinds(HOPELESS, ("no person", "a photo cut short", "nothing")))
+@pytest.mark.parametrize("kind", kinds(HOPELESS, ("a photo cut short", "nothing")))
 def test_start_says_in_one_line_what_is_wrong_with_the_photos(kind, remembered, tmp_path, monkeypatch, capsys):
     """Or that cameras are missing; there is no capture then."""
     monkeypatch.chdir(tmp_path)

@@ -104,13 +104,13 @@ COMMANDS = (
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: `seconds` after its `event`-th change of a file, at 0 just before it; event None: after the start.
+    """When a run is killed: just before its `event`-th change of a file, or so many seconds after the start.
 
-    by: the signal; SIGINT, as Ctrl-C in a terminal, only with event None, and the start is that of the command line.
+    by: the signal; SIGINT, as Ctrl-C in a terminal, after seconds, and the start is that of the command line.
     """
 
-    event: int | None
-    seconds: float
+    event: int | None = None
+    seconds: float = 0.0
     by: int = signal.SIGKILL
 
 
@@ -128,8 +128,8 @@ class Run:
 class Changes:
     """The audit hook of a run: notes changes of files in the place, and kills the run, its group of processes, at one."""
 
-    def __init__(self, place: Path, moment: Moment | None, tell: int):
-        self.place, self.moment, self.tell, self.seen = str(place), moment, tell, []
+    def __init__(self, place: Path, moment: Moment | None):
+        self.place, self.moment, self.seen = str(place), moment, []
         self.start = time.monotonic()
         sys.addaudithook(self.audit)
 
@@ -152,9 +152,7 @@ class Changes:
             return
         self.seen.append((time.monotonic() - self.start, event, path))
         if self.moment is not None and self.moment.event == len(self.seen) - 1:
-            if self.moment.seconds == 0:
-                os.killpg(0, signal.SIGKILL)
-            os.write(self.tell, b"!")
+            os.killpg(0, signal.SIGKILL)
 
 
 def start(command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None):
@@ -195,7 +193,7 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     sys.argv = ["humangs", *command.words(inputs, variant)]
     if moment is not None and moment.by == signal.SIGINT:
         hear_from_the_start(cli, tell)
-    changes, code = Changes(place, moment, tell), 0
+    changes, code = Changes(place, moment), 0
     if most is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
     try:
@@ -241,29 +239,19 @@ def hear_from_the_start(cli, tell):
 def end(begun) -> Run:
     """Waits for a run, kills it at its moment."""
     pid, ready, log, moment = begun
-    deadline = time.monotonic() + SECONDS
-    killed = False
-    try:
-        if moment is not None and moment.event is None and moment.by == signal.SIGKILL:
-            killed = not select.select([ready], [], [], moment.seconds)[0]
-        else:
-            assert select.select([ready], [], [], SECONDS)[0], f"{log}: did not end"
-            if os.read(ready, 1):  # at its moment; an end of file is the end of the process
-                time.sleep(moment.seconds)
-                killed = True
-        if killed:
+    if moment is not None and moment.event is None:
+        if moment.by == signal.SIGINT:
+            assert select.select([ready], [], [], SECONDS)[0], f"{log}: did not begin"
+            os.read(ready, 1)
+        if not select.select([ready], [], [], moment.seconds)[0]:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(pid, moment.by)
-    finally:
-        os.close(ready)
-    status = None
-    while status is None and time.monotonic() < deadline:
-        found, state = os.waitpid(pid, os.WNOHANG)
-        status = state if found else time.sleep(0.01)
-    if status is None:
+    ended = select.select([ready], [], [], SECONDS)[0]  # the end of the pipe is that of the process
+    os.close(ready)
+    if not ended:
         os.killpg(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        raise AssertionError(f"{log}: did not end")
+    status = os.waitpid(pid, 0)[1]
+    assert ended, f"{log}: did not end"
     changes = log / "changes.json"
     code = None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
     texts = [(log / name).read_text() if (log / name).exists() else "" for name in ("out", "errors")]
