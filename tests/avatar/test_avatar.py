@@ -13,7 +13,7 @@ from humangs_jax.avatar.export.splats import write_ply
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.io.reading import FileError
-from humangs_jax.rendering.gaussians import Gaussians, covariances
+from humangs_jax.rendering.gaussians import covariances
 
 COVARIANCE_TOLERANCE = 2e-5  # relative to the largest entry: a float32 SVD and its squares
 
@@ -43,14 +43,10 @@ def test_save_and_load_are_exact(tmp_path, functions):
 def test_batches_of_avatars_are_indexed_and_not_saved(tmp_path):
     people = [make_avatar(seed) for seed in range(3)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *people)
-    assert len(batch) == 3 and batch.batch_shape == (3,) and batch[1:].batch_shape == (2,)
+    assert len(batch) == 3 and batch.batch_shape == (3,)
     for one, person in zip(batch, people, strict=True):
         jax.tree.map(np.testing.assert_array_equal, one, person)
     assert batch[-1].parents == people[2].parents and batch
-    with pytest.raises(IndexError, match="index 3 is out of range for a batch of 3"):
-        batch[3]
-    with pytest.raises(TypeError, match="this Avatar is not a batch"):
-        len(people[0])
     with pytest.raises(ValueError, match=r"expected one avatar, got a batch \(3,\): save each"):
         batch.save(tmp_path / "all.npz")
     with pytest.raises(ValueError, match=r"avatar\.rest_joints: expected shape \(3, 3\), got \(2, 3\)"):
@@ -86,9 +82,7 @@ def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
         (avatar.select(np.zeros(0, int)), "means: expected at least one Gaussian"),
         (unlike(avatar, rest_vertices=jnp.zeros((0, 3))), "rest_vertices: expected at least one vertex"),
         (unlike(avatar, means=drawn.means.at[3, 1].set(jnp.nan)), "means: expected numbers in"),
-        (unlike(avatar, means=drawn.means.at[3, 1].set(3e38)), "means: expected numbers in"),
         (unlike(avatar, scales=drawn.scales.at[3, 1].set(jnp.inf)), "scales: expected numbers in"),
-        (unlike(avatar, colors=drawn.colors.at[3, 1].set(-3e38)), "colors: expected numbers in"),
         (unlike(avatar, rest_joints=avatar.rest_joints.at[0].set(jnp.inf)), "rest_joints: expected numbers in"),
         (unlike(avatar, skinning_weights=0 * avatar.skinning_weights), "skinning_weights: expected rows with the sum 1"),
     ):
@@ -150,15 +144,6 @@ def test_ply_has_the_fields_of_rest_that_some_viewers_want(tmp_path):
     assert sum(name.startswith("f_rest_") for name in names) == 45
 
 
-def test_ply_survives_extremes(tmp_path):
-    import plyfile
-
-    g = Gaussians(jnp.zeros((2, 3)), jnp.zeros((2, 4)), jnp.zeros((2, 3)), jnp.asarray([0.0, 1.0]), jnp.ones((2, 3)))
-    write_ply(tmp_path / "a.ply", g)
-    data = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    assert all(np.isfinite(data[name]).all() for name in data.dtype.names)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -173,13 +158,3 @@ def test_animate_names_what_it_cannot_use(change, message):
     avatar, pose = change(make_avatar(), make_pose())
     with pytest.raises(ValueError, match=message):
         animate(avatar, pose)
-
-
-@pytest.mark.slow
-def test_values_stay_what_they_are_inside_transformations():
-    avatar, pose = make_avatar(), make_pose()
-    bad = replace(pose, translation=pose.translation.at[0].set(jnp.nan))
-    assert np.isnan(jax.jit(animate)(avatar, bad).means[:, 0]).all()
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), pose, pose)
-    moved = jax.vmap(animate, in_axes=(None, 0))(avatar, both)
-    np.testing.assert_allclose(moved.means[1], animate(avatar, pose).means, rtol=1e-6, atol=1e-6)

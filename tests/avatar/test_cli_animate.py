@@ -2,10 +2,6 @@
 
 import dataclasses
 import os
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -64,27 +60,3 @@ def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
     views = read_exr("views/views.exr")
     assert len(views) == 2 and set(views[0].channels) == {"position.X", "position.Y", "position.Z"}
     np.testing.assert_allclose(read_image("views/view_001.png")[0], views[1].rgba[..., :3], atol=3e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
-@pytest.mark.parametrize("out", ["b.mp4", "b.webm", "frames"])
-def test_ctrl_c_in_the_middle_leaves_nothing(out, folder):
-    """Frames are written while they are drawn: the signal comes when a temporary file is there."""
-    before = sorted(folder.iterdir())
-    command = [sys.executable, "-m", "humangs_jax.cli", "animate", "avatar.npz", "--motion", "motion.npz", "--loop", "500"]
-    process = subprocess.Popen(
-        [*command, "--size", "64", "--out", out], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder
-    )
-    try:
-        until = time.monotonic() + 300
-        while sorted(folder.iterdir()) == before and process.poll() is None and time.monotonic() < until:
-            time.sleep(0.05)
-        time.sleep(0.5)
-        assert process.poll() is None, process.communicate()
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=120)
-    finally:
-        process.kill()
-    assert process.returncode == 130 and b"interrupted" in error
-    assert sorted(folder.iterdir()) == before

@@ -201,10 +201,12 @@ def test_numbers_of_turns_never_jump_between_frames(tmp_path):
         assert np.abs(np.diff(quats, axis=0)).max() < 0.3  # a twelfth of a turn
 
 
-@pytest.mark.parametrize("size", [64, 1000])
-def test_a_texture_of_another_size_is_refused(size):
-    with pytest.raises(ValueError, match=f"texture of {size} texels a side: expected a multiple of 128"):
-        mesh_export.body_mesh(avatar(), size)
+def test_bodies_without_faces_and_textures_of_other_sizes_are_refused():
+    for size in (64, 1000):
+        with pytest.raises(ValueError, match=f"texture of {size} texels a side: expected a multiple of 128"):
+            body_mesh(avatar(), size)
+    with pytest.raises(ValueError, match="faces and Gaussians"):
+        body_mesh(replace(avatar(), faces=avatar().faces[:0]))
 
 
 @pytest.mark.slow
@@ -234,12 +236,6 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     expected = textured().posed(one, placed.pose(2)).vertices
     frame = trimesh.load(tmp_path / "x_0002.obj", process=False)
     np.testing.assert_allclose(frame.vertices, expected @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-5)
-
-
-def test_what_has_no_mesh_is_refused():
-    one = avatar()
-    with pytest.raises(ValueError, match="faces and Gaussians"):
-        body_mesh(replace(one, faces=one.faces[:0]))
 
 
 @pytest.mark.skipif(not VALIDATOR.exists(), reason="needs npm's gltf-validator (HUMANGS_NPM: its folder)")

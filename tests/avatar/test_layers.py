@@ -9,9 +9,8 @@ from exr_files import read_exr
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar import frames, layers
-from humangs_jax.avatar.avatar import surface_normals
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.images import read_image
@@ -147,22 +146,3 @@ def test_what_no_frame_shows_can_be_left_out():
     assert kept < 1.2 * n and less.skinning_weights.shape == (kept, 3)
     for whole, part in zip(frames.images(avatar, poses, cameras, shot), frames.images(less, poses, cameras, shot), strict=True):
         assert np.abs(whole - part).max() < 2 / 255
-
-
-def test_normals_of_a_stretched_surface_stay_perpendicular():
-    """Blend skinning shears: normals follow the inverse transpose, so that edges in the surface stay at right angles to them."""
-    avatar = two_balls(2)
-    weights = np.zeros((len(avatar.rest_vertices), 3), np.float32)
-    weights[:, 1] = share = np.clip((np.asarray(avatar.rest_vertices)[:, 1] - 0.2) / 1.4, 0, 1)
-    weights[:, 0] = 1 - share
-    avatar = replace(avatar, skinning_weights=jnp.asarray(weights))
-    pose = BodyPose(jnp.asarray([[0, 0, 0], [0, 0, 0.9], [0, 0, 0]], jnp.float32), jnp.zeros(3))
-    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
-    linear = np.asarray(blend_transforms(avatar.skinning_weights, transforms))[:, :3, :3]
-    rest = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
-    tangents = np.cross(rest, [0.3, 0.5, 0.8])
-    turned = np.einsum("gij,gj->gi", linear, tangents)
-    assert np.abs(np.linalg.det(linear) - 1).max() > 0.1  # no rotations
-    normals = np.asarray(layers.gaussian_normals(avatar, pose))
-    np.testing.assert_allclose((turned * normals).sum(-1), 0, atol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)

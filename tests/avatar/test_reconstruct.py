@@ -9,6 +9,7 @@ import pytest
 
 from humangs_jax.avatar import reconstruct as reconstruction
 from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.avatar import Light
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
     _reconstruct,
@@ -109,14 +110,21 @@ def test_reconstruct_and_render_lower_for_every_platform(body, network):
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
+def made(body, means, size, betas=(0.0,) * 4):
+    """An avatar of round Gaussians, one per vertex."""
+    count = len(means)
+    gaussians = Gaussians(
+        means, jnp.tile(jnp.eye(4)[0], (count, 1)), jnp.full((count, 3), size), jnp.full(count, 0.9), jnp.full((count, 3), 0.5)
+    )
+    return make_avatar(HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3))), body, shape_body(body, jnp.asarray(betas)), tiny())
+
+
 def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
     rng = np.random.default_rng(0)
     pose = BodyPose(jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.ones(3))
     count = len(body.template)
     means = body.template + jnp.asarray(rng.normal(size=(count, 3)) * 0.1 * (rng.random((count, 1)) < 0.2), jnp.float32)
-    gaussians = Gaussians(means, jnp.ones((count, 4)), jnp.ones((count, 3)), jnp.ones(count), jnp.ones((count, 3)))
-    outputs = HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3)))
-    avatar = make_avatar(outputs, body, shape_body(body, jnp.zeros(4)), tiny())
+    avatar = made(body, means, 1.0)
     spread = with_spread_weights(avatar, pose, 0.04)
     changed = np.any(spread.skinning_weights != avatar.skinning_weights, axis=1)
     assert 0.05 < changed.mean() <= 0.25 and not changed[np.linalg.norm(means - body.template, axis=1) < 0.03].any()
@@ -199,21 +207,19 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
     for x, expected in ((corrected, read), (body, plain)):
         own = jax.vmap(lambda r, t, x=x: person_vertices(x, views.betas, BodyPose(r, t)))
         np.testing.assert_allclose(own(views.rotations, views.translations), expected, atol=1e-5)  # float32
-    count, pose = len(body.template), BodyPose(views.rotations[0], views.translations[0])
-    sizes, quats = ((count, 3), (count,), (count, 3)), jnp.tile(jnp.eye(4)[0], (count, 1))
-    outputs = HumanGSOutputs(Gaussians(body.template, quats, *(jnp.full(size, 0.01) for size in sizes)))
-    moved = [skin(make_avatar(outputs, x, shape_body(x, views.betas), config), pose) for x in (corrected, body)]
+    pose = BodyPose(views.rotations[0], views.translations[0])
+    moved = [skin(made(x, body.template, 0.01, views.betas), pose) for x in (corrected, body)]
     np.testing.assert_array_equal(moved[0].means, moved[1].means)
 
 
-def test_light_shines_from_above_in_a_capture_of_another_world(body, network):
+def test_light_shines_from_above_in_a_capture_of_another_world(body):
     """Drawing and fitting an avatar with light give the same in a capture whose z axis points up."""
     photos = capture(body, SIZE, SIZE)
     bent = replace(photos.poses, rotations=photos.poses.rotations.at[:, 16].set(jnp.asarray([0.0, 0.0, -1.2])))
     photos = dataclasses.replace(photos, poses=bent)
-    avatar = reconstruct(network[0], network[1].with_conventions(light=True), photos)
-    count = len(avatar.gaussians.means)
-    shining = replace(avatar.light, coefficients=jnp.arange(8.0) / 8, shading=jnp.zeros(count))
+    avatar = made(body, body.template, 0.05)
+    normals = vertex_normals(avatar.rest_vertices, body.faces)
+    shining = Light(jnp.arange(8.0) / 8, normals, jnp.zeros(len(normals)))
     avatar, turned = replace(avatar, light=shining), with_z_up(photos)
     own, others = (np.asarray([r.rgb for r in capture_renderings(avatar, x)[1]]) for x in (photos, turned))
     np.testing.assert_allclose(own, others, atol=100 * TURNED)
@@ -360,18 +366,6 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), avatar, alone)
 
 
-def test_masks_displace_the_body_if_the_network_looks_at_the_person_alone(body, network):
-    config, photos = network[1].with_conventions(pixels="person"), capture_of(body, 0, 2)
-    photos = dataclasses.replace(photos, masks=np.ones_like(photos.masks))
-    on = config.with_runtime(displacement=True)
-    moved = lambda photos, config: _views(photos, gaussian_body(body, config), config)[0].displacement
-    assert moved(photos, on).shape == body.template.shape
-    assert moved(dataclasses.replace(photos, masks=None), on) is None  # then the result is what it was, bit for bit
-    off = config.with_runtime(displacement=False)
-    assert moved(photos, on.with_conventions(pixels="all")) is None and moved(photos, off) is None
-    assert not moved(photos, config).any()  # no body sticks out of masks that are full
-
-
 def outward(photos):
     """The capture with its body a centimetre thicker."""
     rest = shape_body(photos.body, jnp.asarray(photos.betas))
@@ -379,15 +373,20 @@ def outward(photos):
     return dataclasses.replace(photos, displacement=0.01 * normals)
 
 
-def test_the_displacement_of_a_capture_is_used_and_no_other(body, network):
-    config, photos = network[1].with_conventions(pixels="person"), outward(capture_of(body, 0, 2))
+def test_the_body_is_displaced_by_the_capture_or_its_masks_if_the_network_looks_at_the_person_alone(body, network):
+    config, photos = network[1].with_conventions(pixels="person"), capture_of(body, 0, 2)
+    on, off, all_pixels = config.with_runtime(displacement=True), config.with_runtime(displacement=False), {"pixels": "all"}
+    full = dataclasses.replace(photos, masks=np.ones_like(photos.masks))
     moved = lambda photos, config: _views(photos, gaussian_body(body, config), config)[0].displacement
-    for given in (photos, dataclasses.replace(photos, masks=None)):
-        np.testing.assert_array_equal(moved(given, config.with_runtime(displacement=True)), photos.displacement)
-    off = config.with_runtime(displacement=False)
-    assert moved(photos, config.with_conventions(pixels="all")) is None and moved(photos, off) is None
+    assert not moved(full, config).any()  # no body sticks out of masks that are full
+    assert moved(dataclasses.replace(full, masks=None), on) is None  # then the result is what it was, bit for bit
+    assert moved(full, on.with_conventions(**all_pixels)) is None and moved(full, off) is None
+    given = outward(photos)
+    for each in (given, dataclasses.replace(given, masks=None)):
+        np.testing.assert_array_equal(moved(each, on), given.displacement)
+    assert moved(given, config.with_conventions(**all_pixels)) is None and moved(given, off) is None
     finer = config.with_conventions(longest_edge=0.05)
-    assert len(moved(photos, finer)) == len(gaussian_body(body, finer).template) > len(body.template)
+    assert len(moved(given, finer)) == len(gaussian_body(body, finer).template) > len(body.template)
 
 
 @pytest.mark.parametrize(("wrong", "expected"), [(np.zeros((7, 3)), r"shape \(500, 3\)"), (np.full((500, 3), np.nan), "finite")])

@@ -258,10 +258,6 @@ def with_nan(field, place=(3,)):
     return replace(scene(3), **{field: getattr(scene(3), field).at[place].set(np.nan)})
 
 
-def accessor(**changes):
-    return lambda content: content["accessors"][1].update(changes)
-
-
 def without(name):
     return lambda content: content["meshes"][0]["primitives"][0]["attributes"].pop(f"{EXTENSION}:{name}")
 
@@ -276,42 +272,33 @@ def spz_of(version=3, count=20, degree=0, body=b"", behind=b""):
 
 BAD = {
     "ply of NaN": (lambda: ply(with_nan("scales")), r"scale_\*: expected numbers in \[0"),
-    "ply of NaN in text": (lambda: ply(with_nan("opacities"), form="ascii"), "opacity: expected numbers in"),
-    "ply of NaN harmonics": (lambda: ply(with_nan("harmonics")), r"f_rest_\*: expected"),
+    "ply of NaN in text": (lambda: ply(with_nan("harmonics"), form="ascii"), r"f_rest_\*: expected"),
     "ply cut off": (lambda: ply(scene())[:-1], "element vertex: 20 of them are not in"),
-    "ply of text cut off": (lambda: ply(scene(), form="ascii")[:-900], "the number of columns changed"),
     "ply of few lines": (lambda: ply(scene(), form="ascii").rsplit(b"\n", 2)[0], "expected 20 lines of 14 numbers"),
     "ply of points": (lambda: ply(scene()).replace(b"f_dc_0", b"red"), "f_dc_0: missing: expected Gaussians"),
     "ply of 8 harmonics": (lambda: ply(scene(3)).replace(b"f_rest_8", b"rest_8"), "expected 9, 24 or 45 properties, got 8"),
     "ply of 10^15": (lambda: headed("element vertex 1000000000000000", "property float x"), "the limit gaussians is"),
     "ply of -1": (lambda: headed("element vertex -1", "property float x"), "header: 'element vertex -1'"),
     "ply of nothing each": (lambda: headed("element vertex 9"), "element vertex: 9 of them"),
-    "ply of a list": (lambda: headed("element vertex 1", "property list int float x", body=bytes(99)), "x: missing"),
     "compressed without chunks": (
         lambda: compressed_ply(scene()).replace(b"chunk 1", b"chunk 0"), "chunk: expected one for each 256",
     ),
-    "compressed in floats": (lambda: compressed_ply(scene()).replace(b"uint packed_s", b"float packed_s"), "expected uint32"),
     "compressed of fewer harmonics": (
         lambda: compressed_ply(scene(3)).replace(b"element sh 20", b"element sh 19"), r"f_rest_\*: expected shape \(20,",
     ),
     "splat of 33 bytes": (lambda: bytes(33), "expected 32 bytes for each Gaussian"),
-    "splat of NaN": (lambda: np.full(8, np.nan, "<f4").tobytes(), "position: expected"),
     "splat of a negative scale": (lambda: np.full(8, -1, "<f4").tobytes(), "scale: expected numbers in"),
     "spz of 2^32": (lambda: spz_of(count=2**32 - 1), "4,294,967,295 Gaussians: the limit gaussians"),
     "spz bomb": (lambda: spz_of(count=19_000_000, degree=3), "bytes unpack to"),
     "spz cut off": (lambda: spz(scene(), 3)[:-30], "not a readable file of Gaussians"),
     "spz too short": (lambda: spz_of(body=bytes(399)), "20 Gaussians in 400 bytes, got less"),
-    "spz too long": (lambda: spz_of(body=bytes(401)), "20 Gaussians in 400 bytes, got more"),
     "spz with more behind": (lambda: spz_of(body=bytes(400), behind=b"more"), "not a readable file of Gaussians"),
     "spz 4": (lambda: spz_of(version=4), "version 2 or 3 and degree 0 to 3, got version 4"),
-    "spz of degree 9": (lambda: spz_of(degree=9), "got version 3 and degree 9"),
     "another gzip": (lambda: gzip.compress(b"hello"), "version 2 or 3"),
     "glb of NaN": (lambda: glb(with_nan("opacities")), "OPACITY: expected numbers in"),
-    "glb of logarithms": (lambda: glb(replace(scene(), scales=-scene().scales)), "SCALE: expected numbers in"),
     "glb without rotations": (lambda: glb(scene(), change=without("ROTATION")), "ROTATION: missing"),
     "glb without a harmonic": (lambda: glb(scene(3), change=without("SH_DEGREE_1_COEF_1")), "SH_DEGREE_1_COEF_1: missing"),
-    "glb of few scales": (lambda: glb(scene(), change=accessor(count=19)), r"SCALE: expected shape \(20, 3\)"),
-    "glb of many scales": (lambda: glb(scene(), change=accessor(count=10**15)), "bytes unpacked"),
+    "glb of many scales": (lambda: glb(scene(), change=lambda c: c["accessors"][1].update(count=10**15)), "bytes unpacked"),
     "glb of a mesh": (lambda: glb(scene(), change=lambda c: c["meshes"][0]["primitives"][0].pop("extensions")), "no Gaussians"),
     "glb of compressed Gaussians": (
         lambda: glb(scene(), change=lambda c: c.update(extensionsRequired=["SPZ_2"])), "needs the extension 'SPZ_2'",

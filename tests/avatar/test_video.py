@@ -134,13 +134,6 @@ def test_gif_keeps_its_speed_and_loops(tmp_path, fps, count):
     assert abs(total - 24 / fps * 1000) <= 10
 
 
-def test_gif_background_does_not_flicker(tmp_path):
-    write_video(tmp_path / "a.gif", moving_square(12), 24)
-    back = read_back(tmp_path / "a.gif")
-    still = back[:, 30:, :, :]  # below the square
-    assert (still == still[:1]).all()
-
-
 @pytest.mark.parametrize("background", [1.0, 0.0, 0.37])
 def test_gif_background_is_exact(tmp_path, background):
     """Median cut takes the mean of its boxes: white became 252 beside a person of many colors."""
@@ -166,15 +159,12 @@ NAN[1, 2, 2, 0] = np.nan
     ("name", "frames", "fps", "message"),
     [
         ("a.mp4", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
-        ("a.gif", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
         ("a.mp4", np.zeros((2, 0, 4, 3)), 24, "at least one frame"),
         ("a.mp4", NAN, 24, "frame 1"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), 0, "frames per second"),
-        ("a.mp4", np.zeros((2, 4, 4, 3)), float("inf"), "frames per second"),
         ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"expected a name ending in \.mp4, \.webm, \.gif or a folder"),
         ("a.mp4", np.zeros((2, 4, 4, 4)), 24, r"\.mp4 has no transparency: expected \.webm"),
         ("a.gif", np.zeros((2, 4, 4, 4)), 24, r"\.gif has no transparency"),
-        ("frames", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
     ],
 )
 def test_errors_write_nothing(tmp_path, name, frames, fps, message):
@@ -197,15 +187,4 @@ def test_ffmpeg_failing_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "CONSTANT_RATE_FACTOR", "no number")
     with pytest.raises(OSError, match=r"ffmpeg failed: .*no number"):
         write_video(tmp_path / "a.mp4", moving_square(200), 24)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
-def test_an_interruption_leaves_nothing(tmp_path, name):
-    def drawn():
-        yield from moving_square(5)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / name, drawn(), 24)
     assert list(tmp_path.iterdir()) == []
