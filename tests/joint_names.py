@@ -2,21 +2,18 @@
 
 from bvh_files import CMU
 
+CENTRE = "Hips Spine Chest UpperChest Neck Head"
+
 
 def renamed(limbs, form="{side}{limb}", **middle):
     """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as given."""
     parts = dict(zip(("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"), limbs.split(), strict=True))
-    names = {
-        "pelvis": "Hips",
-        "spine1": "Spine",
-        "spine2": "Chest",
-        "spine3": "UpperChest",
-        "neck": "Neck",
-        "head": "Head",
-    } | middle
-    sided = lambda ours: form.format(
-        side=ours.split("_")[0].title(), s=ours[0], S=ours[0].upper(), limb=parts[ours.split("_")[1]]
-    )
+    names = dict(zip(("pelvis", "spine1", "spine2", "spine3", "neck", "head"), CENTRE.split(), strict=True)) | middle
+
+    def sided(ours):
+        side, limb = ours.split("_")
+        return form.format(side=side.title(), s=side[0], S=side[0].upper(), limb=parts[limb])
+
     return {ours: sided(ours) if "_" in ours else names[ours] for ours in CMU}
 
 
@@ -46,6 +43,7 @@ NAMED = {
     ),
     "behind": renamed("Shoulder Arm ForeArm Hand UpLeg Leg Foot ToeBase", "{limb}Left", pelvis="Hips")
     | {ours: f"{theirs}.R" for ours, theirs in CMU.items() if ours.startswith("right")},
+    "few spine joints": CMU | {"spine1": "Tail", "spine3": "Chest"},
     "numbers": {ours: f"Joint_{i:02d}" for i, ours in enumerate(CMU)},
     "numbers backwards": {ours: f"bone{40 - i}" for i, ours in enumerate(CMU)},
     "unknown words": {ours: f"part {i * 7919 % 1000}" for i, ours in enumerate(CMU)},

@@ -409,7 +409,9 @@ def equal_exposure(capture: Capture) -> Capture:
     """
     capture = usable_views(capture)
     gains = camera_gains(capture)
-    return capture if (gains == 1).all() else with_gains(capture, gains)
+    if capture.masks is None or (gains == 1).all():
+        return capture
+    return dataclasses.replace(capture, images=multiplied(capture.images, capture.masks, gains))
 
 
 def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
@@ -462,13 +464,6 @@ def gains_of(colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]) 
     if not errors or np.sqrt(np.mean(np.square(errors))) < CLEAR:
         return np.ones((count, 3))
     return np.exp(found - found.mean(axis=0))
-
-
-def with_gains(capture: Capture, gains: Float[np.ndarray, "v 3"]) -> Capture:
-    """The capture with the person's colors multiplied; the white behind stays. Raises: ValueError without masks."""
-    if capture.masks is None:
-        raise ValueError("gains need masks: without them the background would be multiplied, too")
-    return dataclasses.replace(capture, images=multiplied(capture.images, capture.masks, gains))
 
 
 def multiplied(

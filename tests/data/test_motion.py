@@ -11,9 +11,8 @@ from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
+from humangs_jax.body.model import RestBody, joint_transforms
 from humangs_jax.cli import animate
-from humangs_jax.core.registry import imported
 from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.data.motion import PELVIS, UPRIGHT, Motion, MotionError, Poses, grounded, load_motion, save_motion
 from humangs_jax.geometry import quaternion
@@ -71,43 +70,6 @@ def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path
     assert "left_hand_pose: hands of 12 numbers are principal coefficients of a model: left flat" in caplog.text
 
 
-def lhm_frame(i, **changes):
-    parts = dict(
-        betas=[0.0] * 10,
-        root_pose=[0.1, 0.01 * i, 0.0],
-        body_pose=random((21, 3), i).tolist(),
-        jaw_pose=[0.1, 0, 0],
-        leye_pose=[0, 0.1, 0],
-        reye_pose=[0, 0, 0.1],
-        lhand_pose=random((15, 3), 10 + i).tolist(),
-        rhand_pose=random((15, 3), 20 + i).tolist(),
-        trans=[0.1 * i, 0, 2],
-        focal=[1000, 1000],
-        princpt=[256, 256],
-        img_size_wh=[512, 512],
-    )
-    return {**parts, **changes}
-
-
-def write_lhm(folder, frames):
-    folder.mkdir()
-    for i, frame in enumerate(frames):
-        (folder / f"{i + 8}.json").write_text(json.dumps(frame))  # 8, 9, 10, 11: numbers, not words
-    return folder
-
-
-def test_lhm(tmp_path):
-    frames = [lhm_frame(i) for i in range(4)]
-    motion = load_motion(write_lhm(tmp_path / "seq", frames))
-    np.testing.assert_allclose(motion.translations[:, 0], [0, 0.1, 0.2, 0.3], atol=FLOAT32)
-    for i, frame in enumerate(frames):
-        names = ("body_pose", "jaw_pose", "leye_pose", "reye_pose", "lhand_pose", "rhand_pose")
-        parts = [np.reshape(frame[k], (-1, 3)) for k in ("root_pose", *names)]
-        np.testing.assert_allclose(motion.rotations[i], np.concatenate(parts), atol=FLOAT32)
-    one = load_motion(tmp_path / "seq" / "10.json")
-    np.testing.assert_array_equal(one.rotations, motion.rotations[2:3])
-
-
 def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """Known to the command's help and to `load_motion`, which finds the one of two formats that a file is by its content."""
     standing = lambda path, reading: Poses(np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text()))
@@ -121,11 +83,6 @@ def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     assert load_motion(tmp_path / "a.pkl").fps == 60.0
 
 
-@pytest.mark.parametrize("each", MOTIONS.values(), ids=MOTIONS)
-def test_every_row_names_code_that_is_there(each):
-    assert callable(imported(each.code)) and each.suffixes
-
-
 # The world's up ------------------------------------------------------------------------------------------------------
 
 
@@ -133,7 +90,7 @@ def rotation_vector(matrix):
     return Rotation.from_matrix(matrix).as_rotvec()
 
 
-@pytest.mark.parametrize("axis", list(UPRIGHT))
+@pytest.mark.parametrize("axis", ["-y", "z", "-x"])
 def test_any_world_is_turned_upright(tmp_path, axis):
     """The same motion in the coordinates of another world comes back, as joints in space."""
     poses, trans = upright_poses(165), random((FRAMES, 3))
@@ -162,7 +119,7 @@ def parts(rotations, translations):
     return dict(global_orient=flat[:, :3], body_pose=flat[:, 3:66], transl=translations, fps=FPS)
 
 
-@pytest.mark.parametrize("heading", [0, 90, 215])
+@pytest.mark.parametrize("heading", [0, 215])
 @pytest.mark.parametrize("kind", motions())
 def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
     """AMASS has z up and the others y, also when people crawl along an axis, lie, or stand on their hands."""
@@ -230,41 +187,29 @@ def without(arrays, key):
     return {k: v for k, v in arrays.items() if k != key}
 
 
+COLUMNS = "expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape"
 BAD = {
     "no motion": (dict(vertices=np.zeros(3)), ": no motion: expected one of the keys rotations"),
-    "columns": (
-        {**AMASS, "poses": np.zeros((FRAMES, 100))},
-        ": poses: expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape (6, 100)",
-    ),
+    "columns": ({**AMASS, "poses": np.zeros((FRAMES, 100))}, f": poses: {COLUMNS} (6, 100)"),
+    "ten joints": ({**AMASS, "poses": np.zeros((FRAMES, 10, 3))}, f": poses: {COLUMNS} (6, 10, 3), 10 joints"),
     "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one number"),
     "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
     "beyond float32": ({**AMASS, "poses": np.full((FRAMES, 165), 1e300)}, ": poses: expected finite numbers, got 1e+300"),
-    "infinite": ({**AMASS, "trans": np.full((FRAMES, 3), np.inf)}, ": trans: expected finite"),
     "counts": ({**AMASS, "trans": np.zeros((FRAMES + 1, 3))}, ": trans: expected shape (6, 3), got (7, 3)"),
     "no trans": (without(AMASS, "trans"), ": trans: missing"),
     "no rate": (without(AMASS, "mocap_framerate"), ": mocap_framerate: missing"),
     "rate 0": ({**AMASS, "mocap_framerate": 0}, ": mocap_framerate: expected a positive"),
-    "words": ({**AMASS, "poses": np.array([["a"]])}, ": poses: expected real numbers, got <U1"),
     "pickled": ({**AMASS, "trans": np.array([None])}, ": trans: a pickled object"),
     "ours": ({**OURS, "rotations": np.zeros((FRAMES, 165))}, ": rotations: expected shape (any, any, 3)"),
     "ours, counts": ({**OURS, "translations": np.zeros((1, 3))}, ": translations: expected shape (6, 3)"),
     "ours, no fps": (without(OURS, "fps"), ": fps: missing"),
-    "aist": (
-        {**AIST, "smpl_poses": np.zeros((FRAMES, 60))},
-        ": smpl_poses: expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape (6, 60)",
-    ),
     "aist, scaling": ({**AIST, "smpl_scaling": 0.0}, ": smpl_scaling: expected a positive"),
-    "ten joints": (
-        {**AMASS, "poses": np.zeros((FRAMES, 10, 3))},
-        ": poses: expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape (6, 10, 3), 10 joints",
-    ),
     "params, body": (
         smpl_params(body_pose=np.zeros((FRAMES, 60))),
         ": body_pose: expected shape (6, 63), or (6, 69) of SMPL, got (6, 60)",
     ),
     "params, orient": (without(smpl_params(), "global_orient"), ": global_orient: missing"),
     "params, hand": (smpl_params(left_hand_pose=np.zeros((2, 45))), ": left_hand_pose: expected shape (6, 45)"),
-    "params, jaw": (smpl_params(jaw_pose=np.zeros((FRAMES, 4))), ": jaw_pose: expected shape (6, 3)"),
 }
 
 
@@ -300,10 +245,16 @@ def test_other_bad_files(tmp_path, capsys):
     assert "not valid JSON" in message(tmp_path / "broken.json")
     (tmp_path / "list.json").write_text("[1]")
     assert "no motion: expected one of the keys" in message(tmp_path / "list.json")
-    frames = [lhm_frame(0), {k: v for k, v in lhm_frame(1).items() if k != "trans"}]
-    assert "9.json: trans: missing" in message(write_lhm(tmp_path / "some", frames))
-    ragged = write_lhm(tmp_path / "ragged", [lhm_frame(0), lhm_frame(1, body_pose=[[0, 0, 0]])])
-    assert "body_pose: expected numbers" in message(ragged)
+    frame = {"root_pose": [0.0] * 3, "body_pose": [[0.0] * 3] * 21, "trans": [0.0] * 3}
+    for name, change, problem in (
+        ("some", lambda frame: frame.pop("trans"), "9.json: trans: missing, but 8.json has it"),
+        ("ragged", lambda frame: frame.update(body_pose=[[0, 0, 0]]), "body_pose: expected numbers"),
+    ):
+        (tmp_path / name).mkdir()
+        change(other := dict(frame))
+        for number, each in ((8, frame), (9, other)):
+            (tmp_path / name / f"{number}.json").write_text(json.dumps(each))
+        assert problem in message(tmp_path / name)
     assert "fps: expected a positive" in message(write(tmp_path / "ok.npz", **AMASS), fps=-1)
     with pytest.raises(ValueError, match="up: expected auto, y"):
         load_motion(tmp_path / "ok.npz", up="w")
@@ -362,14 +313,6 @@ def test_at_rate_turns_at_an_even_speed():
     wanted = quaternion.from_axis_angle(jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32))
     got = quaternion.from_axis_angle(fast.rotations[:, 0])
     np.testing.assert_allclose(np.abs(np.sum(got * wanted, axis=-1)), 1, atol=FLOAT32)
-
-
-def test_motions_are_pytrees():
-    motion = Motion(jnp.zeros((4, 2, 3)), jnp.ones((4, 3)), 24.0)
-    poses = jax.vmap(lambda rotations, translation: BodyPose(rotations, translation))(motion.rotations, motion.translations)
-    assert poses.translation.shape == (4, 3)
-    doubled = jax.jit(lambda m: jax.tree.map(lambda x: 2 * x, m))(motion)
-    assert doubled.fps == 24.0 and float(doubled.translations.max()) == 2
 
 
 @pytest.mark.slow

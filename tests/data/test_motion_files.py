@@ -224,6 +224,16 @@ def smplerx(rotations=ROTATIONS, places=PLACES, number=0):
     return [npz(f"{i:05}_{number}.npz", **row, betas=np.zeros((1, 10))) for i, row in enumerate(rows)]
 
 
+def lhm():
+    """A file a frame, whose numbers are no words: 8, 9, 10."""
+    names = ("root_pose", "body_pose", "jaw_pose", "leye_pose", "reye_pose", "lhand_pose", "rhand_pose")
+    frames = []
+    for rotations, place in zip(ROTATIONS, PLACES.tolist(), strict=True):
+        parts = [each.tolist() for each in np.split(rotations, (1, 22, 23, 24, 25, 40))]
+        frames.append(dict(zip(names, parts, strict=True)) | {"root_pose": parts[0][0], "trans": place})
+    return texts([f"{i + 8}.json" for i in range(FRAMES)], frames)
+
+
 def slahmr(people):
     stacked = [np.stack(x) for x in zip(*((r[:, 0], r[:, 1:22].reshape(len(r), -1), p) for r, p in people), strict=True)]
     return npz(
@@ -285,6 +295,7 @@ FILES = {
     "TRAM": (tram(), BODY, {}),
     "TRAM, one track": (lambda folder: tram()(folder) / "hps" / "hps_track_0.npy", BODY, {}),
     "SMPLer-X": (all_of(*(in_folder("smplx", each) for each in smplerx())), [*WITH_FACE, *range(25, 55)], {}),
+    "LHM": (lhm(), EVERY, {}),
     "smplcodec": (npz("subject-1.smpl", **CODEC), [*range(40)], {}),
     "HuMoR": (npz(root_orient=ROTATIONS[:, 0], pose_body=FLAT[:, 3:66], trans=PLACES, betas=np.zeros(16)), BODY, {}),
     "AMASS, separate": (

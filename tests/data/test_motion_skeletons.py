@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import json
 import logging
-import struct
 
 import numpy as np
 import pytest
@@ -128,32 +126,19 @@ def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
 
 def test_joints_between_those_we_know_turn_bones_too(tmp_path):
     """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm starts where the file's does."""
-    rest, poses = person(), dance(3, names=CMU)
-    text = write_bvh(rest, poses, CMU)
-    bend = Rotation.from_euler("ZYX", [[40, 20, 0]] * 3, degrees=True)
-    lines, depth = text.splitlines(), 0
-    start = next(i for i, line in enumerate(lines) if line.strip() == "JOINT LeftForeArm")
-    for end in range(start + 1, len(lines)):
-        depth += lines[end].count("{") - lines[end].count("}")
-        if depth == 0:
-            break
-    channels = "CHANNELS 3 Zrotation Yrotation Xrotation"
-    lines[start:end] = ["JOINT Roll", "{", "OFFSET 0 0 0", channels, *lines[start:end], "}"]
-    before = sum(3 * (1 + ("ROOT" in line)) for line in lines[:start] if "ROOT" in line or "JOINT" in line)
-    at = next(i for i, line in enumerate(lines) if line.startswith("Frame Time")) + 1
-    for frame in range(3):
-        numbers = lines[at + frame].split()
-        numbers[before:before] = [f"{x:.8f}" for x in bend[frame].as_euler("ZYX", degrees=True)]
-        lines[at + frame] = " ".join(numbers)
-    rotations, translations, _ = loaded(tmp_path, "\n".join(lines), rest_joints=rest)
-    expected = poses.copy()
+    rest, poses, bent = person(), dance(3, names=CMU), dance(3, names=CMU)
     arm, elbow = INDEX["left_shoulder"], INDEX["left_elbow"]
-    ours = places_of(rest, rotations, translations + rest[0])
-    turned = Rotation.from_rotvec(poses[:, arm]) * bend
-    expected[:, arm] = turned.as_rotvec()
-    theirs = places_of(rest, expected, translations + rest[0])
-    direction = lambda places: (places[:, elbow] - places[:, arm]) / np.linalg.norm(rest[elbow] - rest[arm])
-    np.testing.assert_allclose(direction(ours), direction(theirs), atol=EXACT)
+    bent[:, arm] = (Rotation.from_rotvec(poses[:, arm]) * Rotation.from_euler("ZYX", [40, 20, 0], degrees=True)).as_rotvec()
+    clips = []
+    for each in (poses, bent):
+        (tmp_path / "a.bvh").write_text(write_bvh(rest, each, CMU))
+        clips.append(read_bvh(tmp_path / "a.bvh"))
+    turns = clips[1].turns.copy()
+    shoulder = clips[0].names.index("LeftArm")
+    turns[:, shoulder] = clips[0].turns[:, shoulder]  # as if another joint below it had turned
+    rotations, translations, _ = retargeted(dataclasses.replace(clips[1], turns=turns), rest)
+    direction = lambda poses: np.diff(places_of(rest, poses, translations + rest[0])[:, [arm, elbow]], axis=1)
+    np.testing.assert_allclose(direction(rotations), direction(bent), atol=EXACT)
 
 
 def test_a_rest_pose_in_which_nobody_stands_gets_its_twists_from_the_motion(tmp_path):
@@ -210,27 +195,16 @@ def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
     np.testing.assert_allclose(rotations[:, ankles], 0, atol=1e-4)
 
 
-@pytest.mark.parametrize("gap", [" ", "   ", "\t", " \t "])
+@pytest.mark.parametrize("gap", ["   ", " \t "])
 @pytest.mark.parametrize("brace", ["\n{", "{", " {"])
 def test_names_with_spaces(tmp_path, gap, brace):
     """As Biped and Rocketbox have them: a name ends with its line, or before a brace."""
-    limbs = {"shoulder": "UpperArm", "elbow": "Forearm", "wrist": "Hand", "collar": "Clavicle"}
-    limbs |= {"hip": "Thigh", "knee": "Calf", "ankle": "Foot", "foot": "Toe0"}
-    names = {o: gap.join(["Bip01", o[0].upper(), limbs[o.split("_")[1]]] if "_" in o else ["Bip01", o.title()]) for o in CMU}
+    names = {ours: theirs.replace(" ", gap) for ours, theirs in NAMED["Rocketbox"].items()}
     rest, poses = person(), dance(3, names=CMU)
     text = "\n".join(line.strip(" \t") for line in write_bvh(rest, poses, names).splitlines()).replace("\n{", brace)
     for ending in ("\n", "\r\n"):
         rotations, _, _ = loaded(tmp_path, text.replace("\n", ending), rest_joints=rest)
         np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
-
-
-def test_few_spine_joints(tmp_path):
-    rest, poses = person(), np.zeros((2, 55, 3))
-    names = {ours: theirs for ours, theirs in CMU.items()}
-    poses[:, INDEX["left_knee"], 0] = 0.5
-    text = write_bvh(rest, poses, names).replace("LowerBack", "Tail").replace("Spine1", "Chest")
-    rotations, _, _ = loaded(tmp_path, text, rest_joints=rest)
-    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
 
 
 HEAD = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
@@ -363,13 +337,8 @@ def test_a_clip_of_several_is_chosen_by_name_or_number(tmp_path, caplog):
 
 def test_bones_of_a_vrm_are_those_that_it_says(tmp_path):
     rest, poses = person(), dance(3, names=CMU)
-    words = dict(
-        zip(
-            ["collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"],
-            (*("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes"),),
-            strict=True,
-        )
-    )
+    ours = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot")
+    words = dict(zip(ours, ["Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes"], strict=True))
     middle = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest"}
     bones = {o: o.split("_")[0] + words[o.split("_")[1]] if "_" in o else middle.get(o, o) for o in CMU}
     joints = [name for name in JOINT_NAMES if name in CMU]
@@ -382,49 +351,35 @@ def test_bones_of_a_vrm_are_those_that_it_says(tmp_path):
 
 
 def test_glb_files_that_are_no_motion(tmp_path):
-    def message(document, writer=None):
-        (writer or GlbWriter()).write(tmp_path / "a.glb", document)
-        with pytest.raises(MotionError) as caught:
-            load_motion(tmp_path / "a.glb")
-        assert str(tmp_path / "a.glb") in str(caught.value) and "\n" not in str(caught.value)
-        return str(caught.value)
-
-    nodes = {"nodes": [{"children": [1]}, {"children": [0]}]}
     writer = GlbWriter()
     times, turns = writer.array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.ones((2, 4)))
-    track = lambda **sampler: {
-        "animations": [
-            {
-                "channels": [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}],
-                "samplers": [{"input": times, "output": turns} | sampler],
-            }
-        ]
-    }
-    assert "without an animation" in message({})
-    assert "below itself" in message(nodes | track(), writer)
-    assert "one rotation for each of increasing times" in message({"nodes": [{}]} | track(output=times), writer)
-    assert "expected the names of CMU" in message({"nodes": [{"name": "a"}]} | track(), writer)
-    assert "turns no joint" in message({"nodes": [{}], "animations": [{"channels": [], "samplers": []}]})
+    channel = {"sampler": 0, "target": {"node": 0, "path": "rotation"}}
+
+    def track(output=turns, channels=(channel,)):
+        return {"animations": [{"channels": list(channels), "samplers": [{"input": times, "output": output}]}]}
+
+    for document, problem in (
+        ({}, "without an animation"),
+        ({"nodes": [{"children": [1]}, {"children": [0]}]} | track(), "below itself"),
+        ({"nodes": [{}]} | track(output=times), "one rotation for each of increasing times"),
+        ({"nodes": [{"name": "a"}]} | track(), "expected the names of CMU"),
+        ({"nodes": [{}]} | track(channels=()), "turns no joint"),
+        ({"nodes": [{}]} | track(channels=(channel, channel)), "two tracks for the rotation of node 0"),
+    ):
+        writer.write(tmp_path / "a.glb", document)
+        with pytest.raises(MotionError, match=problem) as caught:
+            load_motion(tmp_path / "a.glb")
+        assert str(tmp_path / "a.glb") in str(caught.value) and "\n" not in str(caught.value)
     (tmp_path / "a.glb").write_text("hello")
     with pytest.raises(MotionError, match="no GLB file"):
         load_motion(tmp_path / "a.glb")
-    times, turns = (writer := GlbWriter()).array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.ones((2, 4)))
-    twice = track()["animations"][0]
-    twice["channels"] *= 2
-    assert "two tracks for the rotation of node 0" in message({"nodes": [{}], "animations": [twice]}, writer)
 
 
 def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
     """A character of many clips has a megabyte of it; a scan, which another library loads, may not."""
-    write_glb(tmp_path / "a.glb", person(), dance(2), np.zeros((2, 3)), MIXAMO)
-    data = (tmp_path / "a.glb").read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    text = json.loads(data[20 : 20 + length]) | {"extras": ["clip"] * 150_000}
-    text = json.dumps(text, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + data[20 + length :]
-    (tmp_path / "b.glb").write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
-    assert len(text) > 1_000_000
+    for name, more in (("a.glb", {}), ("b.glb", {"extras": ["clip"] * 150_000})):
+        write_glb(tmp_path / name, person(), dance(2), np.zeros((2, 3)), MIXAMO, **more)
+    assert (tmp_path / "b.glb").stat().st_size > 1_000_000
     one, other = (load_motion(tmp_path / name) for name in ("a.glb", "b.glb"))
     np.testing.assert_array_equal(one.rotations, other.rotations)
 

@@ -15,15 +15,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.formats import PLACES, ArrayKeys
 from humangs_jax.data.motion import MotionError, Poses, Reading, skeleton
 from humangs_jax.data.motion.people import SHOWN, Person, are_rotations, format_of, read_people
-from humangs_jax.data.motion.rules import (
-    COLUMNS,
-    HAND_NUMBERS,
-    MILLIMETRES,
-    NO_PLACES,
-    NO_RATE,
-    PELVIS,
-    joint_places,
-)
+from humangs_jax.data.motion.rules import COLUMNS, HAND_NUMBERS, MILLIMETRES, NO_PLACES, NO_RATE, PELVIS, joint_places
 from humangs_jax.data.motion.skeleton import Clip
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile

@@ -30,22 +30,9 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import read_body
 from humangs_jax.core.array_types import Float
+from humangs_jax.data.motion import rules
 from humangs_jax.data.motion.matching import matched
-from humangs_jax.data.motion.rules import (
-    BETTER_TILT,
-    CLEARLY_UP,
-    FEET,
-    LARGEST_BEND,
-    NEXT,
-    RATE_ROUNDING,
-    SIDES,
-    STANDING,
-    TOPS,
-    nearest_axis,
-    sampled_frames,
-    up_axis,
-    upright_matrix,
-)
+from humangs_jax.data.motion.rules import nearest_axis, sampled_frames, up_axis, upright_matrix
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.reading import Refused
 
@@ -76,7 +63,7 @@ def bytes_of_clip(frames: int, joints: int) -> int:
 
 def whole_rate(fps: float) -> float:
     """Frames per second, a whole number where they are one up to the rounding of the file: BVH has 0.0083333 for 120."""
-    return float(round(fps)) if abs(fps - round(fps)) < RATE_ROUNDING * fps else fps
+    return float(round(fps)) if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps else fps
 
 
 @functools.cache
@@ -125,7 +112,7 @@ def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[st
     axis, cosine = nearest_axis(unit(trunk).mean(axis=0))
     chosen = sampled_frames(len(clip.places))
     points = scale * clip.places[chosen][:, sorted(source.values())]
-    return up_axis(points, axis if cosine >= CLEARLY_UP else None, usual, clip.fps)
+    return up_axis(points, axis if cosine >= rules.CLEARLY_UP else None, usual, clip.fps)
 
 
 _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
@@ -135,7 +122,7 @@ _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 
 def _top(source: Source) -> str:
-    return next(name for name in TOPS if name in source)
+    return next(name for name in rules.TOPS if name in source)
 
 
 def _spine(clip: Clip, source: Source) -> Float[np.ndarray, "3"]:
@@ -143,8 +130,8 @@ def _spine(clip: Clip, source: Source) -> Float[np.ndarray, "3"]:
 
 
 def _stands(clip: Clip, source: Source) -> bool:
-    legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in SIDES)
-    return float(unit(legs) @ _spine(clip, source)) < STANDING
+    legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in rules.SIDES)
+    return float(unit(legs) @ _spine(clip, source)) < rules.STANDING
 
 
 def _body_turns(
@@ -159,7 +146,7 @@ def _body_turns(
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
         align = _pelvis_frame(clip, source, joints) if parent < 0 else frames_of[parent]
-        child = next((other for other in NEXT.get(name, ()) if other in source), None)
+        child = next((other for other in rules.NEXT.get(name, ()) if other in source), None)
         if parent < 0:
             world.append(_pelvis_turns(clip, source, turns, places) @ align)
         elif name not in source:
@@ -205,14 +192,14 @@ def _pelvis_turns(
         a, b = (Rotation.from_matrix(turns[:, joint]) for joint in (clip.parents[left], clip.parents[right]))
         other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
         own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
-        return other if tilt < own_tilt - BETTER_TILT else own
+        return other if tilt < own_tilt - rules.BETTER_TILT else own
     spine = [top]
     while clip.parents[spine[0]] not in (-1, pelvis):
         spine.insert(0, clip.parents[spine[0]])
     apart = 0.01 * np.linalg.norm(clip.rest[top] - clip.rest[pelvis])
     lowest = next((j for j in spine if np.linalg.norm(clip.rest[j] - clip.rest[pelvis]) > apart), top)
     tilt = tilts(own, lowest)
-    if np.abs(tilt).mean() <= LARGEST_BEND:
+    if np.abs(tilt).mean() <= rules.LARGEST_BEND:
         return own
     return Rotation.from_rotvec(tilt[:, None] * unit(line)).as_matrix() @ own
 
@@ -256,7 +243,7 @@ def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
 
 def _feet(source: Source) -> list[list[str]]:
     """Our names of the joints that may touch the floor: of both sides by kind."""
-    return [found for kind in FEET if (found := [name for name in kind if name in source])]
+    return [found for kind in rules.FEET if (found := [name for name in kind if name in source])]
 
 
 def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
