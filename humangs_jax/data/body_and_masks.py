@@ -145,18 +145,13 @@ def _sampling(
 
 # Displacement ----------------------------------------------------------------------------------------------------------
 
-INSET = (0.005, 0.025)
-"""Metres that the body may lie inside the masks: the network adds clothes on top, and knows naked bodies under them."""
-OUTWARDS, INWARDS, STEP = 0.05, 0.06, 0.0025
-"""Metres along the normal within which a mask's edge is looked for, and the steps of the search."""
-SMOOTHNESS = 0.03
-"""Metres over which a displacement spreads."""
+STEP = 0.0025
+"""Metres along a normal, of the search for a mask's edge."""
 WEAKNESS = 0.002
 """Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
 HELD = 20.0
 """The same, for hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
-ITERATIONS = 2
 NEAR, PROBE, LEAVES = 2.5, 0.012, 0.6
 """A vertex is on the body's silhouette if it is within this many pixels of the edge, and if a move by PROBE metres along its
 normal leaves the silhouette by this share of it."""
@@ -182,15 +177,15 @@ PerVertex = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """How a surface moves to the edges of the masks: see `OUTWARDS`, `INWARDS`, `SMOOTHNESS` and `INSET`, whose values are those
-    of a body.
+    """How a surface moves to the edges of the masks, metres: within which distance along its normals they are looked for, over
+    which a move spreads, and how far the surface may lie inside. Bodies: the network adds clothes on top, and knows naked ones.
     """
 
-    outwards: float = OUTWARDS
-    inwards: float = INWARDS
-    smoothness: float = SMOOTHNESS
-    inset: tuple[float, float] = INSET
-    iterations: int = ITERATIONS
+    outwards: float = 0.05
+    inwards: float = 0.06
+    smoothness: float = 0.03
+    inset: tuple[float, float] = (0.005, 0.025)
+    iterations: int = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,7 +219,7 @@ class MaskedView:
 
 
 def displacement(
-    body: BodyModel, capture: Capture, inset: tuple[float, float] = INSET, *, always: bool = True
+    body: BodyModel, capture: Capture, inset: tuple[float, float] = Reach.inset, *, always: bool = True
 ) -> Float[np.ndarray, "n 3"]:
     """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it fills the masks; bounded.
 

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -236,13 +236,19 @@ def cropped(capture: Capture, size: int) -> Capture:
         boxes.append((*((low + high - side) // 2).tolist(), side))
     if min(side for *_, side in boxes) >= max(height, width):
         return capture
+    return _squares(capture, boxes, size)
+
+
+def _squares(capture: Capture, boxes: Sequence[tuple[int, int, int]], size: int) -> Capture:
+    """The photos, each cut to a square (left, top, side), white beyond the photo, and resized to `size` pixels."""
     cut = lambda array, fill: np.stack([resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)])
     left, top, sides = np.asarray(boxes, np.float32).T
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
     scale = np.stack([size / sides, size / sides, np.ones_like(sides)], axis=-1)
     cameras = replace(capture.cameras, K=(capture.cameras.K - shift) * scale[:, :, None], width=size, height=size)
-    return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=cut(capture.masks, 0.0), cameras=cameras)
+    masks = None if capture.masks is None else cut(capture.masks, 0.0)
+    return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=masks, cameras=cameras)
 
 
 def _window(image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float) -> Float[np.ndarray, "side side *c"]:
@@ -283,23 +289,15 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     """
     capture = usable_views(capture)
     capture = cropped(capture, size) if crop else capture
-    images = capture.images
-    masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
-    height, width = images.shape[1:3]
+    height, width = capture.images.shape[1:3]
     side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
-    pad = ((0, 0), (top, side - height - top), (left, side - width - left))
-    images = np.pad(images, (*pad, (0, 0)), constant_values=1.0)
-    masks = np.pad(masks, pad)
-    if side != size:
-        images, masks = (np.stack([resized(x, size, size) for x in stack]) for stack in (images, masks))
-    shift = jnp.asarray([[0, 0, left], [0, 0, top], [0, 0, 0]], jnp.float32)
-    square = replace(capture.cameras, K=capture.cameras.K + shift, width=side, height=side)
+    square = _squares(capture, [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count, size)
+    masks = np.zeros(square.images.shape[:3], np.float32) if square.masks is None else square.masks
     frames = np.asarray(capture.frames)
     return SubjectViews(
-        images=jnp.asarray(images, jnp.float32),
+        images=jnp.asarray(square.images, jnp.float32),
         masks=jnp.asarray(masks, jnp.float32),
-        cameras=square.resized(size, size),
+        cameras=square.cameras,
         rotations=jnp.asarray(capture.poses.rotations)[frames],
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),

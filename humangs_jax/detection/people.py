@@ -337,17 +337,7 @@ def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list
     if not any(person.crop.side >= LARGE * longest for person in found):
         smaller = window_detections(networks, photo, SMALL_SHARES)
         found = _people(networks, photo, detections + smaller) if smaller else found
-    return [
-        DetectedPerson(
-            person.pixels + 0.5,
-            person.visibility,
-            person.world,
-            person.presence,
-            mask_in_photo(person, width, height),
-            person.crop.side,
-        )
-        for person in found
-    ]
+    return [DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side) for p in found]
 
 
 def _people(networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: list[Detection]) -> list[Landmarks]:

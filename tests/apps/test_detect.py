@@ -1,6 +1,7 @@
 """`humangs detect`: who is chosen, what is written, and what is said where that is not clear."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -120,14 +121,12 @@ def test_keypoints_and_masks_of_photos(photos, tmp_path, capsys):
 
 
 def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
-    def missing():
-        raise ImportError("finding people in photos needs LiteRT")
-
-    monkeypatch.setattr(detect, "Networks", missing)
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
     (tmp_path / "photos").mkdir()
     write_png(tmp_path / "photos" / "black.png", np.zeros((64, 64, 3)))
     assert cli.execute(["detect", str(tmp_path / "photos"), "--out", str(tmp_path / "found")]) == cli.BAD_DATA
-    assert "error: finding people in photos needs LiteRT" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in said and said.count("\n") == 1
 
 
 def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.body_and_masks import HELD_JOINTS, INWARDS, OUTWARDS, WRAP, displacement
+from humangs_jax.data.body_and_masks import HELD_JOINTS, WRAP, Reach, displacement
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import gaussian_body, on_gaussian_body, subject_rest
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -22,7 +22,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 SIZE, COAT = 384, 0.01
 FOUND = 0.003
 """Metres: a pixel of these masks shows 6 mm, and its edge is known to half of that."""
-BOUND = 2 * max(INWARDS, OUTWARDS) + WRAP
+BOUND = 2 * max(Reach.inwards, Reach.outwards) + WRAP
 POSES = 2
 
 

@@ -1,7 +1,5 @@
 """People found in the photos of the demo capture, whose bodies are known; steps of BlazePose on small inputs."""
 
-import importlib
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -274,12 +272,3 @@ def test_detections_of_one_person_are_one_and_the_best_is_kept():
     found = [person(0.9, 50.0, 20.0), person(0.8, 53.0, 22.0), person(0.7, 50.0, 40.0), person(0.6, 90.0, 20.0)]
     assert [each.score for each in distinct(found, 200)] == [0.9, 0.7, 0.6]
     assert distinct(found, 20_000) == []  # specks
-
-
-def test_without_litert_the_line_says_what_to_install(monkeypatch):
-    def missing(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(ImportError, match=r"pip install 'humangs_jax\[photos\]'"):
-        Networks()

@@ -65,13 +65,13 @@ def read_summary(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     check_photos(folder, views, together=False)
     for view in views:
         image, mask = folder / view["image"], folder / view.get("mask", "")
-        shape, has_alpha = _check_image(image)
+        shape, has_alpha = read_checked(check_image, image)
         size = size or shape
         if shape != size:
             raise CaptureError(image, "size", f"{shape}, but the first view has {size}: expected one size")
         if "mask" not in view and not has_alpha:
             raise CaptureError(folder, "", "no masks: training needs to know where the person is")
-        if "mask" in view and (masked := _check_image(mask)[0]) != size:
+        if "mask" in view and (masked := read_checked(check_image, mask)[0]) != size:
             raise CaptureError(mask, "size", f"{masked}, but its image has {size}: expected the same")
     assert size is not None  # a description has views
     width, height = size
@@ -88,17 +88,6 @@ def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
     if DEFAULT_BODY in (name, str(body_file)):
         return name == str(body_file)
     return (folder / name).resolve() == Path(body_file).resolve()
-
-
-def _check_image(file: Path) -> tuple[tuple[int, int], bool]:
-    return read_checked(check_image, file)
-
-
-def _check_inputs(seen: StoredSubject, inputs: Sequence[int]) -> None:
-    """Whether the masks of the first views, the inputs, show somebody: a white photo would be read as the person."""
-    empty = [view for view, mask in zip(inputs, seen.masks, strict=False) if not (mask > MASK_THRESHOLD * 255).any()]
-    if empty:
-        raise CaptureError(f"views[{empty[0]}]", "mask", "empty: no photo to reconstruct the person from")
 
 
 @runtime_checkable
@@ -294,12 +283,18 @@ class CaptureSource:
                 continue
             try:
                 seen = self.cache.some_views(subject_index, [*inputs, *targets])
-                _check_inputs(seen, inputs)
+                # a white photo would be read as the person
+                shown = [(mask > MASK_THRESHOLD * 255).any() for mask in seen.masks[: len(inputs)]]
+                if not all(shown):
+                    empty = inputs[shown.index(False)]
+                    raise CaptureError(f"views[{empty}]", "mask", "empty: no photo to reconstruct the person from")
             except (ValueError, OSError) as error:
                 # this example goes to the next subject; others, of other views, do not: the order depends on files alone
                 self.cache.note(subject_index, str(error))
                 continue
-            shown, asked = range(len(inputs)), range(len(inputs), len(inputs) + len(targets))
-            views = lambda indices, size: subject_views(seen, indices, size, self.depths)  # noqa: B023 (called at once)
-            return self.cache.name(subject_index), Example(views(shown, self.input_size), views(asked, self.target_size))
+            first, last = range(len(inputs)), range(len(inputs), len(seen.images))
+            example = Example(
+                subject_views(seen, first, self.input_size, self.depths), subject_views(seen, last, self.target_size, self.depths)
+            )
+            return self.cache.name(subject_index), example
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")
