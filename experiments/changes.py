@@ -61,37 +61,32 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
     return {"warnings": warnings, "reach": reach} | {name: scores[name] for name in ("psnr", "psnr_fg")}
 
 
-def photos(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+def change(function: Callable[..., Any]) -> Callable[..., Change]:
+    """`function(capture, *how)` as `function(*how)(capture)`."""
+    return lambda *how, **named: lambda capture: function(capture, *how, **named)
+
+
+@change
+def photos(capture, changed: Callable[[np.ndarray], np.ndarray]):
     """Other colors on the person; white behind."""
-
-    def changed(capture):
-        masks = capture.masks[..., None]
-        return dataclasses.replace(capture, images=masks * np.clip(change(capture.images), 0, 1) + (1 - masks))
-
-    return changed
+    masks = capture.masks[..., None]
+    return dataclasses.replace(capture, images=masks * np.clip(changed(capture.images), 0, 1) + (1 - masks))
 
 
-def masks(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+@change
+def masks(capture, changed: Callable[[np.ndarray], np.ndarray]):
     """Other masks, white where they are 0."""
-
-    def changed(capture):
-        found = change(capture.masks)
-        shown = found[..., None] * capture.images + (1 - found[..., None])
-        return dataclasses.replace(capture, masks=found, images=shown)
-
-    return changed
+    found = changed(capture.masks)
+    return dataclasses.replace(capture, masks=found, images=found[..., None] * capture.images + (1 - found[..., None]))
 
 
-def cameras(K: Callable = lambda K: K, matrix: Callable = lambda m: m) -> Change:
+@change
+def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
     """Other cameras for the same photos."""
-
-    def changed(capture):
-        old = capture.cameras
-        intrinsics = np.stack([K(np.array(x)) for x in old.K]).astype(np.float32)
-        extrinsics = np.stack([matrix(np.array(x)) for x in old.cam_from_world]).astype(np.float32)
-        return dataclasses.replace(capture, cameras=dataclasses.replace(old, K=intrinsics, cam_from_world=extrinsics))
-
-    return changed
+    old = capture.cameras
+    intrinsics = np.stack([K(np.array(x)) for x in old.K]).astype(np.float32)
+    extrinsics = np.stack([matrix(np.array(x)) for x in old.cam_from_world]).astype(np.float32)
+    return dataclasses.replace(capture, cameras=dataclasses.replace(old, K=intrinsics, cam_from_world=extrinsics))
 
 
 def focal(factor: float) -> Callable:
@@ -99,85 +94,60 @@ def focal(factor: float) -> Callable:
     return lambda K: K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
 
 
-def far(meters: float) -> Change:
+@change
+def far(capture, meters: float):
     """Cameras moved back along their axes, with the focal lengths that leave the person as large as before."""
-
-    def moved(capture):
-        distance = float(np.mean([np.asarray(m)[2, 3] for m in capture.cameras.cam_from_world]))
-
-        back = np.eye(4)
-        back[2, 3] = meters - distance
-        return cameras(focal(meters / distance), lambda m: back @ m)(capture)
-
-    return moved
+    distance = float(np.mean([np.asarray(m)[2, 3] for m in capture.cameras.cam_from_world]))
+    back = np.eye(4)
+    back[2, 3] = meters - distance
+    return cameras(focal(meters / distance), lambda m: back @ m)(capture)
 
 
-def zoom(factor: float) -> Change:
+@change
+def zoom(capture, factor: float):
     """The person smaller or larger in the frame, cameras to match."""
+    side = capture.images.shape[1]
+    inner, cut = max(1, round(side * min(factor, 1))), round(side / factor)
 
-    def changed(capture):
-
-        side = capture.images.shape[1]
-        inner = max(1, round(side * min(factor, 1)))
-
-        def zoomed(image, empty):
-            if factor < 1:
-                small = np.full_like(image, empty)
-                start = (side - inner) // 2
-                small[start : start + inner, start : start + inner] = resized(image, inner, inner)
-                return small
-            cut = round(side / factor)
+    def zoomed(image, empty):
+        if factor >= 1:
             start = (side - cut) // 2
             return resized(image[start : start + cut, start : start + cut], side, side)
+        small, start = np.full_like(image, empty), (side - inner) // 2
+        small[start : start + inner, start : start + inner] = resized(image, inner, inner)
+        return small
 
-        images = np.stack([zoomed(image, 1.0) for image in capture.images])
-        shapes = np.stack([zoomed(mask, 0.0) for mask in capture.masks])
-        about = np.array([[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]])
-        moved = cameras(lambda K: about @ K)(capture)
-        return dataclasses.replace(moved, images=images, masks=shapes)
-
-    return changed
+    images = np.stack([zoomed(image, 1.0) for image in capture.images])
+    shapes = np.stack([zoomed(mask, 0.0) for mask in capture.masks])
+    about = np.array([[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]])
+    return dataclasses.replace(cameras(lambda K: about @ K)(capture), images=images, masks=shapes)
 
 
-def poses(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+@change
+def poses(capture, changed: Callable[[np.ndarray], np.ndarray]):
     """Other rotations of the joints for the same photos."""
-
-    def changed(capture):
-        rotations = np.asarray(change(np.array(capture.poses.rotations)), np.float32)
-        return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, rotations=rotations))
-
-    return changed
+    rotations = np.asarray(changed(np.array(capture.poses.rotations)), np.float32)
+    return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, rotations=rotations))
 
 
-def tall(factor: float) -> Change:
+def _placed(place: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Cameras whose translations are others: (4, 4) -> (3,)."""
+    return cameras(matrix=lambda m: np.block([[m[:3, :3], place(m)[:, None]], [m[3:]]]))
+
+
+@change
+def tall(capture, factor: float):
     """A body, and a world, of another size."""
-
-    def changed(capture):
-        body = dataclasses.replace(
-            capture.body,
-            template=capture.body.template * factor,
-            shape_directions=capture.body.shape_directions * factor,
-        )
-        moved = dataclasses.replace(capture.poses, translation=capture.poses.translation * factor)
-
-        def away(m):
-            m[:3, 3] *= factor
-            return m
-
-        return dataclasses.replace(cameras(matrix=away)(capture), body=body, poses=moved)
-
-    return changed
+    scaled = {name: getattr(capture.body, name) * factor for name in ("template", "shape_directions")}
+    moved = dataclasses.replace(capture.poses, translation=capture.poses.translation * factor)
+    away = _placed(lambda m: factor * m[:3, 3])(capture)
+    return dataclasses.replace(away, body=dataclasses.replace(capture.body, **scaled), poses=moved)
 
 
 def at_the_pelvis(capture):
     """Every camera inside of the body."""
     pelvis = np.asarray(capture.poses.translation[0]) + np.array([0, 0.9, 0])
-
-    def inside(m):
-        m[:3, 3] = -m[:3, :3] @ pelvis
-        return m
-
-    return cameras(matrix=inside)(capture)
+    return _placed(lambda m: -m[:3, :3] @ pelvis)(capture)
 
 
 def turned(m):
@@ -191,23 +161,21 @@ def without_weights(capture):
     return dataclasses.replace(capture, body=body)
 
 
-def betas(value: float) -> Change:
+@change
+def betas(capture, value: float):
     """All shape coefficients the same."""
-    return lambda capture: dataclasses.replace(capture, betas=np.full_like(np.asarray(capture.betas), value))
+    return dataclasses.replace(capture, betas=np.full_like(np.asarray(capture.betas), value))
 
 
-def spoilt(name: str, value: float = np.nan) -> Change:
+@change
+def spoilt(capture, name: str, value: float = np.nan):
     """NaN, or another number, in one place of one array."""
-
-    def changed(capture):
-        owner, _, field = name.rpartition(".")
-        target = getattr(capture, owner) if owner else capture
-        array = np.array(getattr(target, field))
-        array.reshape(-1)[0] = value
-        target = dataclasses.replace(target, **{field: array})
-        return dataclasses.replace(capture, **{owner: target}) if owner else target
-
-    return changed
+    owner, _, field = name.rpartition(".")
+    target = getattr(capture, owner) if owner else capture
+    array = np.array(getattr(target, field))
+    array.reshape(-1)[0] = value
+    target = dataclasses.replace(target, **{field: array})
+    return dataclasses.replace(capture, **{owner: target}) if owner else target
 
 
 def random_turns(rotations: np.ndarray) -> np.ndarray:
@@ -222,58 +190,42 @@ def noise(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=shape)
 
 
-def turned_by(degrees: float) -> Change:
+@change
+def turned_by(capture, degrees: float):
     """Every camera turned about an axis of its own."""
-
-    def changed(capture):
-        count = capture.view_count
-        axes = noise(2, (count, 3))
-        axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
-        turns = iter(np.asarray(matrix_from_axis_angle(jnp.asarray(axes))))
-
-        def turn(m):
-            m[:3] = next(turns) @ m[:3]
-            return m
-
-        return cameras(matrix=turn)(capture)
-
-    return changed
+    axes = noise(2, (capture.view_count, 3))
+    axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
+    turns = iter(np.asarray(matrix_from_axis_angle(jnp.asarray(axes))))
+    return cameras(matrix=lambda m: np.concatenate([next(turns) @ m[:3], m[3:]]))(capture)
 
 
-def moved_by(centimeters: float) -> Change:
+@change
+def moved_by(capture, centimeters: float):
     """The body moved, in one direction."""
-
-    def changed(capture):
-        step = noise(3, (3,))
-        translation = np.asarray(capture.poses.translation) + (centimeters / 100 * step / np.linalg.norm(step))
-        moved = dataclasses.replace(capture.poses, translation=translation.astype(np.float32))
-        return dataclasses.replace(capture, poses=moved)
-
-    return changed
+    step = noise(3, (3,))
+    translation = np.asarray(capture.poses.translation) + (centimeters / 100 * step / np.linalg.norm(step))
+    return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, translation=translation.astype(np.float32)))
 
 
-def grown(pixels: int) -> Change:
-    """Masks dilated (or eroded, below 0); what they show of the background is grey."""
+def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """The mask dilated, or eroded below 0."""
     side = 2 * abs(pixels) + 1
-
-    def changed(capture):
-
-        change = ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion
-        found = np.stack([change(mask, (side, side)) for mask in capture.masks])
-        inside = np.minimum(found, capture.masks)[..., None]
-        true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(capture.masks[..., None], 1e-6)
-        around = (found[..., None] - inside) * 0.5
-        images = np.clip(inside * true + around + (1 - found[..., None]), 0, 1).astype(np.float32)
-        return dataclasses.replace(capture, images=images, masks=found)
-
-    return changed
+    return mask if pixels == 0 else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))
 
 
-def person_of(pixels: float) -> Change:
+@change
+def masks_grown(capture, pixels: int):
+    """Masks dilated (or eroded, below 0); what they show of the background is grey."""
+    found = np.stack([grown(mask, pixels) for mask in capture.masks])
+    inside = np.minimum(found, capture.masks)[..., None]
+    true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(capture.masks[..., None], 1e-6)
+    around = (found[..., None] - inside) * 0.5
+    images = np.clip(inside * true + around + (1 - found[..., None]), 0, 1).astype(np.float32)
+    return dataclasses.replace(capture, images=images, masks=found)
+
+
+@change
+def person_of(capture, pixels: float):
     """The person that high in every photo, about."""
-
-    def changed(capture):
-        heights = [np.ptp(np.flatnonzero((mask > 0.5).any(axis=1))) + 1 for mask in capture.masks]
-        return zoom(pixels / float(np.mean(heights)))(capture)
-
-    return changed
+    heights = [np.ptp(np.flatnonzero((mask > 0.5).any(axis=1))) + 1 for mask in capture.masks]
+    return zoom(pixels / float(np.mean(heights)))(capture)

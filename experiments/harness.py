@@ -240,3 +240,12 @@ def figure(
     path.parent.mkdir(parents=True, exist_ok=True)
     drawn.savefig(path, dpi=150)
     plt.close(drawn)
+
+
+def staircase(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Of (time, quality) the points that are better than all that are faster."""
+    steps: list[tuple[float, float]] = []
+    for x, y in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not steps or y > steps[-1][1]:
+            steps.append((x, y))
+    return steps

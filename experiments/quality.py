@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
+from experiments.changes import grown
 from experiments.harness import Run, entry, figure, means
 from experiments.pictures import cropped, frontal_view, write_triples
 from experiments.results import markdown_table, page_of
@@ -273,9 +273,3 @@ def in_a_room(images: np.ndarray, masks: np.ndarray, seed: int) -> np.ndarray:
         room += NOISE * rng.normal(size=room.shape)
         photos.append(np.round(255 * np.clip(image + (1 - mask[..., None]) * (room - 1), 0, 1)) / 255)
     return np.stack(photos).astype(np.float32)
-
-
-def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """The mask dilated, or eroded below 0."""
-    side = 2 * abs(pixels) + 1
-    return mask if pixels == 0 else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))

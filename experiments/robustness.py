@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import changes
+from experiments.changes import noise
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from experiments.subjects import HeldOut, make_evaluation_subject
@@ -43,37 +44,31 @@ class Case:
     network: Callable[[Any, Any], tuple[Any, Any]] = lambda variables, config: (variables, config)
 
 
-def weights(change: Callable[[Any], Any]) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """Other variables."""
-    return lambda variables, config: (change(variables), config)
-
-
 def computed(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Another type of number for the encoder's products."""
     return lambda variables, config: (variables, config.with_runtime(dtype=dtype))
 
 
-def in_type(dtype: str) -> Callable[[Any], Any]:
+def in_type(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
     """All variables in another type of number."""
-    return lambda variables: jax.tree.map(lambda x: x.astype(dtype), variables)
+    return lambda variables, config: (jax.tree.map(lambda x: x.astype(dtype), variables), config)
 
 
-def nan_in(variables: Any) -> Any:
+def with_nan(variables: Any, config: Any) -> tuple[Any, Any]:
     """NaN in one entry of the first array."""
     leaves, structure = jax.tree.flatten(variables)
     leaves[0] = np.array(leaves[0])
     leaves[0].reshape(-1)[0] = np.nan
-    return jax.tree.unflatten(structure, leaves)
+    return jax.tree.unflatten(structure, leaves), config
 
 
-NOISE = np.random.default_rng(0)
 CASES: dict[str, Case] = {
     "as it is": Case(),
     "4 stops over": Case(changes.photos(lambda x: 16 * x)),
     "4 stops under": Case(changes.photos(lambda x: x / 16)),
     "black": Case(changes.photos(np.zeros_like)),
     "white": Case(changes.photos(np.ones_like)),
-    "noise": Case(changes.photos(lambda x: NOISE.random(x.shape).astype(np.float32))),
+    "noise": Case(changes.photos(lambda x: np.random.default_rng(0).random(x.shape).astype(np.float32))),
     "focal length x 2": Case(changes.cameras(changes.focal(2.0))),
     "focal length / 2": Case(changes.cameras(changes.focal(0.5))),
     "focal length x 10": Case(changes.cameras(changes.focal(10.0))),
@@ -110,11 +105,11 @@ CASES: dict[str, Case] = {
     "NaN in the joint regressor": Case(changes.spoilt("body.joint_regressor")),
     "NaN in the skinning weights": Case(changes.spoilt("body.skinning_weights")),
     "infinity in betas": Case(changes.spoilt("betas", np.inf)),
-    "NaN in the weights": Case(network=weights(nan_in)),
+    "NaN in the weights": Case(network=with_nan),
     "NaN in a pose to be drawn": Case(held_out=changes.spoilt("poses.rotations")),
     "NaN in a camera that draws": Case(held_out=changes.spoilt("cameras.K")),
-    "weights in bfloat16": Case(network=weights(in_type("bfloat16"))),
-    "weights in float16": Case(network=weights(in_type("float16"))),
+    "weights in bfloat16": Case(network=in_type("bfloat16")),
+    "weights in float16": Case(network=in_type("float16")),
     "float16 compute": Case(network=computed("float16")),
     "bfloat16 compute": Case(network=computed("bfloat16")),
 }
@@ -163,32 +158,24 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
     "noise": (
         "standard deviation",
         0,
-        {x: changes.photos(lambda image, x=x: image + x * changes.noise(4, image.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
+        {x: changes.photos(lambda i, x=x: i + x * noise(4, i.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
     ),
-    "distance of the cameras": (
-        "m",
-        None,
-        {x: changes.far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)},
-    ),
-    "height of the person": (
-        "pixels of 256",
-        None,
-        {x: changes.person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)},
-    ),
-    "masks too large or small": ("pixels of 256", 0, {x: changes.grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
+    "distance of the cameras": ("m", None, {x: changes.far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)}),
+    "height of the person": ("pixels of 256", None, {x: changes.person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
+    "masks too large or small": ("pixels of 256", 0, {x: changes.masks_grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
     "focal length": ("%", 0, {x: changes.cameras(changes.focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
     "cameras turned": ("degrees", 0, {x: changes.turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
     "joints turned": (
         "degrees",
         0,
-        {x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * changes.noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
+        {x: changes.poses(lambda r, x=x: r + np.radians(x) / 3**0.5 * noise(5, r.shape)) for x in (1, 2, 4, 8, 16)},
     ),
     "body moved": ("cm", 0, {x: changes.moved_by(x) for x in (0.5, 1, 2, 4, 8)}),
     "shape coefficients": (
         "standard deviations",
         0,
         {
-            x: lambda c, x=x: dataclasses.replace(c, betas=np.asarray(c.betas) + np.float32(x * changes.noise(6, c.betas.shape)))
+            x: lambda c, x=x: dataclasses.replace(c, betas=np.asarray(c.betas) + np.float32(x * noise(6, c.betas.shape)))
             for x in (0.25, 0.5, 1, 2)
         },
     ),
@@ -273,8 +260,7 @@ def stability(run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16
     types: number types to compare
     seeds: people
     """
-    cases = with_room([shipped_case(seed) for seed in range(seeds)])
-    worst = _worst(cases, [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
+    worst = _worst(shipped_cases(seeds), [name for name in types if name != "tf32" or jax.default_backend() == "gpu"])
     columns = [(n, c) for n in next(iter(worst.values())) for c in COLUMNS if n != "float16" or c == "values"]
     show = lambda stage, name, column: f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
     rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
@@ -292,7 +278,8 @@ def _worst(cases, types):
                 for column, arrays in columns.items():
                     for leaf, array in arrays.items():
                         truth = np.asarray(reference[stage][column][leaf], np.float64)
-                        error = relative_error(np.asarray(array, np.float64), truth)
+                        norm = np.linalg.norm(truth)
+                        error = float(np.linalg.norm(np.asarray(array, np.float64) - truth) / (norm or 1.0))
                         cell = worst.setdefault(stage, {}).setdefault(name, {})
                         known = cell.get(column, {}).get("error", -1.0)
                         if np.isnan(error) or known < error:  # NaN is the worst
@@ -300,28 +287,17 @@ def _worst(cases, types):
     return worst
 
 
-def with_room(cases):
-    """The cases, each (variables, config, body, example), with one body and one token capacity: a program serves all."""
-    config, body = cases[0][1], gaussian_body(cases[0][2], cases[0][1])
-    size = config.conventions.image_size
-    examples = [Example(standardize(photos, size), standardize(targets, size)) for *_, photos, targets in cases]
+def shipped_cases(count):
+    """(variables, config, body, example) of people of the validation seeds, with one token capacity: a program serves all."""
+    whole, (variables, config) = load_body(), load_weights()
+    body, size, examples = gaussian_body(whole, config), config.conventions.image_size, []
+    for seed in seeds_of("validation", 0, count):
+        person = make_evaluation_subject(seed, whole, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
+        examples.append(Example(standardize(person.inputs(changes.VIEWS), size), standardize(person.held_out, size)))
     inputs = [prepare_inputs(body, example.inputs, config) for example in examples]
     fitted = [fit_buffers(each.foreground, each.view_count, config) for each in inputs]
     config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
-    return [(variables, config, body, example) for (variables, *_), example in zip(cases, examples, strict=True)]
-
-
-def relative_error(value, truth):
-    """Norm of the difference over that of the truth; 0 where both vanish."""
-    difference, norm = np.linalg.norm(value - truth), np.linalg.norm(truth)
-    return float(difference / norm) if norm else float(difference)
-
-
-def shipped_case(seed):
-    """Variables, configuration, body and example of a person of the validation seeds."""
-    body, (variables, config) = load_body(), load_weights()
-    person = make_evaluation_subject(seeds_of("validation", seed, 1)[0], body, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
-    return variables, config, body, person.inputs(changes.VIEWS), person.held_out
+    return [(variables, config, body, example) for example in examples]
 
 
 def observe(case, name):
@@ -330,9 +306,9 @@ def observe(case, name):
     run = TrainConfig(model=config, loss=LossConfig(random_background=0.0), target_size=config.conventions.image_size)
     wide = name == "float64"
     number = np.float64 if wide else np.float32
-    cast = lambda tree: jax.tree.map(lambda x: np.asarray(x, number) if is_real(x) else np.asarray(x), tree)
-    products = {"float64": "highest", "float32": "highest", "tf32": "tensorfloat32"}.get(name, "highest")
-    with jax.enable_x64(wide), jax.default_matmul_precision(products):
+    real = lambda x: jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)
+    cast = lambda tree: jax.tree.map(lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree)
+    with jax.enable_x64(wide), jax.default_matmul_precision("tensorfloat32" if name == "tf32" else "highest"):
         learned = cast(variables["params"]), cast(variables.get("batch_stats", {}))
         if name == "float16":
             model = config.with_runtime(dtype="float16", scan=False)
@@ -360,8 +336,3 @@ def observer(model, run):
         return recorder.given
 
     return jax.jit(forward)
-
-
-def is_real(x):
-    """Whether an array holds floating-point numbers."""
-    return jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)

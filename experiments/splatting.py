@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.costs import temporary_mb
-from experiments.harness import Run, entry, figure
+from experiments.harness import Run, entry, figure, staircase
 from experiments.results import markdown_table
 from experiments.subjects import shipped_person
 from experiments.timing import timed
@@ -277,24 +277,14 @@ def knobs_table(result: dict[str, Any]) -> str:
     return f"{title}\n\n{markdown_table(header, rows)}"
 
 
-def pareto(rows: Sequence[dict[str, Any]], time: str) -> list[dict[str, Any]]:
-    """The settings that no other beats in both time and PSNR, fastest first."""
-    front, best = [], -np.inf
-    for row in sorted(rows, key=lambda row: (row[time], -row["psnr"])):
-        if row["psnr"] > best:
-            front.append(row)
-            best = row["psnr"]
-    return front
-
-
 def plot(path: Path, result: dict[str, Any]) -> None:
     """Time relative to exact against PSNR: a line for each knob, the presets, and the front of all settings."""
     exact, *others = result["settings"]
     rows = [exact | {"knob": "preset", "forward": 1.0}]
     rows += [row for row in others if row["knob"] not in SCHEDULE and row["label"] != "inria"]
     with figure(path, 1, (8, 4.4)) as axis:
-        steps = zip(*((row["forward"], row["psnr"]) for row in pareto(rows, "forward")), strict=True)
-        axis.step(*steps, where="post", color="0.8", lw=3, label="best of all settings")
+        steps = staircase([(row["forward"], row["psnr"]) for row in rows])
+        axis.step(*zip(*steps, strict=True), where="post", color="0.8", lw=3, label="best of all settings")
         for i, knob in enumerate(dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")):
             points = [(row["forward"], row["psnr"]) for row in rows if row["knob"] == knob]
             style = "s" if knob == "combined" else "o-"

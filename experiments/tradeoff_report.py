@@ -1,11 +1,10 @@
 """The points of the trade of speed against accuracy; its tables, images and front."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Any
 
-from experiments.harness import Run, figure, means
+from experiments.harness import Run, figure, means, staircase
 from experiments.results import REPOSITORY, markdown_table, significant, write_json
 from humangs_jax.apps.settings import PRESETS, Settings
 from humangs_jax.network.runtime import Runtime
@@ -304,13 +303,3 @@ def draw(rows: list[Row], key: str, path: Path) -> None:
             axis.xaxis.set_major_formatter("{x:g}")
             axis.xaxis.set_minor_formatter(NullFormatter())
         axes[0].legend(fontsize=7)
-
-
-def staircase(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points that are better than all that are cheaper."""
-    steps, highest = [], -math.inf
-    for x, y in sorted(pairs):
-        if y > highest:
-            steps.append((x, y))
-            highest = y
-    return steps

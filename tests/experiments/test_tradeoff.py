@@ -25,7 +25,6 @@ def test_the_front_has_what_nothing_else_beats():
     ]
     assert [r["name"] for r in report.front_of(rows)] == ["fast", "slow", "slower to draw, better", "refined"]
     assert [report.kind(r) for r in rows[:3]] == ["feed-forward", "feed-forward", "refined"]
-    assert report.staircase([(1, 3), (2, 2), (3, 5), (0.5, 1)]) == [(0.5, 1), (1, 3), (3, 5)]
 
 
 def test_the_points_are_many_and_change_one_knob_each():
