@@ -22,17 +22,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
-import numpy as np
 import tyro
 
 from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import keep_freed_memory
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.losses.loss_networks import load_loss_networks
-from humangs_jax.network.config import HumanGSConfig, paper_parts
-from humangs_jax.network.humangs import init_humangs
-from humangs_jax.network.parts import Variables
-from humangs_jax.network.weights import expected_variables, flatten_variables, load_weights, save_weights
+from humangs_jax.network.weights import flatten_variables, load_weights, save_weights, variables_from_tensors
 from humangs_jax.people.bank import load_bank
 from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.config import TrainConfig, small
@@ -42,7 +38,6 @@ from humangs_jax.training.sources import on_the_fly_people, training_people
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 VALIDATION_SUBJECTS = 8
-HEADS = "params/decoder/"
 
 
 def main(
@@ -63,13 +58,13 @@ def main(
         bank: people.npz of another run instead.
         validation: folder of captures of other people, for validation; made in out/validation by default.
         hours: save and end after so long; the same command goes on. Default: until the last step.
-        init_weights: start from these weights instead of fresh ones, see `fit_variables` for how much their network may
-            differ from that of `config`; "shipped": the package's own.
+        init_weights: start from these weights instead of fresh ones, of a network with the tensors of that of `config`;
+            "shipped": the package's own.
         start_share: when the last step is done, also write out/mean.safetensors: this share of the first weights and the
             rest of the trained ones.
         config: the run.
 
-    Raises: ValueError for a share that is not in [0, 1), or without `init_weights`.
+    Raises: ValueError for a share that is not in [0, 1), or without `init_weights`, and for weights of another network.
     """
     if not 0 <= start_share < 1 or (start_share and init_weights is None):
         raise ValueError(f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is not 0")
@@ -80,8 +75,8 @@ def main(
         timer.start()
     body, variables = load_body(), None
     if init_weights is not None:
-        variables, model = load_weights(None if init_weights == "shipped" else init_weights)
-        variables = jax.tree.map(np.asarray, fit_variables(variables, model, config.model))
+        variables, _ = load_weights(None if init_weights == "shipped" else init_weights)
+        variables = variables_from_tensors(flatten_variables(variables), config.model, str(init_weights))
     if validation is None:
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
@@ -102,53 +97,6 @@ def write_mean(out: Path, start: Any, share: float) -> None:
     trained, model = load_weights(out / "weights.safetensors")
     mean = jax.tree.map(lambda first, last: share * first + (1 - share) * last, start, trained)
     save_weights(out / "mean.safetensors", mean, model, "float16")
-
-
-def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:
-    """Variables of the network `old` for the network `new`, to train on.
-
-    Both have the paper's reader and decoder. `new` may have shells where `old` has none, another number of free Gaussians and
-    other settings without tensors. New tensors start as initialised, and with zero weight where they enter a layer. With
-    another `decoder.frame` offsets and rotations are initialised again, because their axes differ.
-
-    Raises: ValueError naming the setting or the tensor if more differs.
-    """
-    (_, old_reader, old_decoder), (_, new_reader, new_decoder) = map(paper_parts, (old.architecture, new.architecture))
-    for name, was, wanted in (  # either shifts what tensors hold
-        ("reader.sample_rgb", old_reader.sample_rgb, new_reader.sample_rgb),
-        ("decoder.tight", old_decoder.tight, new_decoder.tight),
-    ):
-        if was != wanted:
-            raise ValueError(f"{name} {was}: that of trained weights cannot become {wanted}")
-    if old_reader.shells not in ((), new_reader.shells):
-        raise ValueError(f"shells {old_reader.shells}: those of trained weights cannot become {new_reader.shells}")
-    ours, wanted = flatten_variables(variables), flatten_variables(expected_variables(new))
-    anew = {key for key in wanted if key.startswith(f"{HEADS}shells_")} - set(ours)
-    if unknown := sorted((set(ours) - set(wanted)) | (set(wanted) - set(ours) - anew)):
-        raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
-    if old_decoder.frame != new_decoder.frame:
-        anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
-
-    differ = {key for key in set(ours) - anew if ours[key].shape != wanted[key].shape}
-    heads = {key for key in differ if key.startswith(HEADS) and key.split("/")[-2].endswith("_out")}
-    trunk = {key for key in differ if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(wanted[key])}
-    if wrong := sorted(differ - heads - trunk):
-        was, now = ours[wrong[0]].shape, wanted[wrong[0]].shape
-        raise ValueError(f"tensor {wrong[0]!r} has shape {was}, the other network wants {now}")
-    if not (anew | differ):
-        return variables
-
-    def fit(key, leaf):
-        if key in trunk:  # shells and normals enter last
-            return leaf.at[len(ours[key]) :].set(0).at[: len(ours[key])].set(ours[key])
-        if key in heads:  # Gaussians come one after the other
-            both = min(leaf.shape[-1], ours[key].shape[-1])
-            return leaf.at[..., :both].set(ours[key][..., :both])
-        return leaf if key in anew else ours[key]
-
-    fresh = flatten_variables(init_humangs(jax.random.key(0), new))  # compiles for a while: only where it is needed
-    structure = jax.tree.structure(expected_variables(new))
-    return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
 
 
 if __name__ == "__main__":

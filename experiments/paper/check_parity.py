@@ -4,8 +4,6 @@ A blended transform is no rotation, and the quaternion that the release makes of
 tie. Where ours tie to within the bound, the nearer one counts: rounding decides there, in the release as here.
 """
 
-import json
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +17,8 @@ from experiments.results import markdown_table
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.arrays import read_npz
+from humangs_jax.io.reading import read_json
 from humangs_jax.network.config import HumanGSConfig, paper_parts
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.encoder import encoder_pixels, sample_triplane
@@ -64,11 +64,7 @@ MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 
 def load_arrays(path: Path) -> dict[str, Any]:
     """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each other."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (zipfile.BadZipFile, ValueError, AttributeError) as error:  # AttributeError: a bare .npy
-        raise ValueError(f"{path} is no readable .npz of numbers: {error}") from error
+    arrays = read_npz(path)[0]
     sizes: dict[str, int] = {}
     for name, axes in INPUTS.items():
         if name not in arrays:
@@ -85,68 +81,26 @@ def load_arrays(path: Path) -> dict[str, Any]:
 
 
 def read_release_config(path: Path) -> dict[str, Any]:
-    """The settings of a release's configuration that bear on the forward pass, under their names there; None: not said.
+    """The settings of a release's configuration, as "part.name".
 
     Raises: ValueError if it is no JSON object, or asks for what does not exist here.
     """
-    try:
-        content = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} is no JSON: {error}") from error
-
-    def setting(*keys):
-        value = content
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        return value
-
-    if not isinstance(setting("model"), dict):
+    content = read_json(path)
+    if not isinstance(content, dict) or not isinstance(content.get("model"), dict):
         raise ValueError(f"{path}: expected an object with 'model'")
-    if setting("training", "use_canonical_maps"):
+    parts = content["model"] | {"training": content.get("training")}
+    found = {f"{part}.{name}": x for part, values in parts.items() if isinstance(values, dict) for name, x in values.items()}
+    if found.get("training.use_canonical_maps"):
         raise ValueError(f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported")
-    if setting("training", "target_height") not in (None, 1.8):
-        raise ValueError(f"{path}: training.target_height must be 1.8, got {setting('training', 'target_height')!r}")
-    names = {
-        "neural_texture": ("resolution", "dim"),
-        "image_tokenizer": ("patch_size",),
-        "transformer": (
-            "d",
-            "d_head",
-            "n_layer",
-            "use_qk_norm",
-            "use_cls_token",
-            "use_upsampler",
-            "project_all_vertices",
-        ),
-        "vertex_decoder": ("hidden_dim", "num_tight_gaussians", "num_free_gaussians", "learnable_lbs_weights"),
-    }
-    return {f"{part}.{name}": setting("model", part, name) for part, keys in names.items() for name in keys}
+    if (height := found.get("training.target_height")) not in (None, 1.8):
+        raise ValueError(f"{path}: training.target_height must be 1.8, got {height!r}")
+    return found
 
 
 def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int) -> HumanGSConfig:
-    """A checkpoint's configuration with what the release's one adds to it.
-
-    Raises: ValueError naming a setting that does not agree with the checkpoint's shapes.
-    """
-    encoder, _, decoder = paper_parts(config.architecture)
-    transformer = encoder.transformer
-    found = {
-        "neural_texture.resolution": encoder.texture.resolution,
-        "neural_texture.dim": encoder.texture.channels,
-        "image_tokenizer.patch_size": encoder.patch_size,
-        "transformer.d": transformer.width,
-        "transformer.d_head": transformer.head_width,
-        "transformer.n_layer": transformer.layers,
-        "transformer.use_qk_norm": transformer.qk_norm,
-        "transformer.use_cls_token": transformer.class_token,
-        "transformer.use_upsampler": encoder.upsampler is not None,
-        "vertex_decoder.hidden_dim": decoder.hidden,
-        "vertex_decoder.learnable_lbs_weights": decoder.skinning_joints is not None,
-    }
-    for name, value in found.items():
-        if release[name] not in (None, value):
-            raise ValueError(f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint")
-    tight, free = (release[f"vertex_decoder.num_{kind}_gaussians"] for kind in ("tight", "free"))
+    """A checkpoint's configuration with what the release's one adds to it. Raises: ValueError for another number of Gaussians."""
+    decoder = paper_parts(config.architecture)[2]
+    tight, free = (release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free"))
     if tight is not None and free is not None:
         if tight + free != decoder.gaussians_per_vertex:
             raise ValueError(
@@ -154,7 +108,7 @@ def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, 
                 f"{decoder.gaussians_per_vertex} a vertex in the checkpoint"
             )
         decoder = decoder.clone(tight=tight, free=free)
-    pool = "visible" if release["transformer.project_all_vertices"] is False else "all"
+    pool = "visible" if release.get("transformer.project_all_vertices") is False else "all"
     config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
     return config.with_runtime(dtype="bfloat16" if dtype == "bfloat16" else "float32")
 
@@ -276,7 +230,9 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
     """(what `compute_stages` gives for all subjects, the arrays of the file)."""
     config, arrays = (checkpoint.with_suffix(suffix) for suffix in (".json", ".npz"))
     release, expected = read_release_config(config), load_arrays(arrays)
-    converted = load_checkpoint(checkpoint, head_width=_head_width(release))
+    # the width of a head is only needed where the checkpoint does not tell it
+    width = release.get("transformer.d_head") if release.get("transformer.use_qk_norm") is False else None
+    converted = load_checkpoint(checkpoint, head_width=width)
     settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
     if expected["in_lbs_weights"].shape != converted.skinning_weights.shape:
         raise ValueError(
@@ -295,11 +251,6 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
         name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects]) for name in subjects[0]
     }
     return found, expected
-
-
-def _head_width(release: dict[str, Any]) -> int | None:
-    """Only needed where the checkpoint does not tell it; there a disagreement is reported by `complete_config`."""
-    return None if release["transformer.use_qk_norm"] is not False else release["transformer.d_head"]
 
 
 @entry

@@ -15,6 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import load_weights, save_weights
+from humangs_jax.training.config import tiny as tiny_run
 from humangs_jax.training.state import TrainState
 
 HALF_PRECISION = 2**-11
@@ -44,9 +45,11 @@ def test_the_mean_of_the_first_and_the_trained_weights(tmp_path):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, HALF_PRECISION), mean, expected)
 
 
-def test_a_share_of_no_first_weights_is_an_error(tmp_path):
+def test_wrong_first_weights_are_an_error(tmp_path):
     with pytest.raises(ValueError, match=r"start_share 0.5: expected .* init_weights"):
         train_shipped.main(tmp_path, start_share=0.5)
+    with pytest.raises(ValueError, match="shipped: tensor"):
+        train_shipped.main(tmp_path, init_weights="shipped", config=tiny_run())
 
 
 def test_a_share_of_the_learning_rate_is_that_share_of_an_update(monkeypatch):

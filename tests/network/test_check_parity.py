@@ -158,7 +158,6 @@ UNUSABLE = {
     "an input of another shape": (spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}), "in_c2w has shape"),
     "an input not finite": (spoil(lambda a: a | {"in_image": a["in_image"] * np.nan}), "in_image"),
     "no stages": (spoil(lambda a: {k: x for k, x in a.items() if k.startswith("in_")}), "no stage"),
-    "other sizes": (reconfigure("transformer", n_layer=3), "model.transformer.n_layer is 3"),
     "another K": (reconfigure("vertex_decoder", num_free_gaussians=0), "1 tight and 0 free"),
     "canonical maps": (reconfigure("training", use_canonical_maps=True), "use_canonical_maps"),
     "another height": (reconfigure("training", target_height=1.0), "target_height"),

@@ -6,14 +6,12 @@ import os
 import jax
 import numpy as np
 import pytest
-from network_cases import TINY, random_inputs, random_variables
+from network_cases import TINY, random_variables
 from safetensors.numpy import load_file, save_file
 
-from experiments.train_shipped import fit_variables
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.network import presets, weights
 from humangs_jax.network.config import paper_parts
-from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import load_weights, save_weights
 
 ENCODER, READER, DECODER = paper_parts(TINY.architecture)
@@ -125,57 +123,3 @@ def test_configurations_survive_json(name):
     config = presets.PRESETS[name]()
     assert config_from_json(type(config), config_to_json(config)) == config
     assert config_from_json(type(config), "{}") == type(config)()
-
-
-def grown(**decoder):
-    """TINY without shells and in the canonical frame, and a network with shells and another number of Gaussians."""
-    plain = TINY.with_parts(
-        reader=dataclasses.replace(READER, shells=()), decoder=dataclasses.replace(DECODER, frame="canonical")
-    )
-    return plain, TINY.with_parts(decoder=dataclasses.replace(DECODER, **decoder))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("more", [-1, 0, 2])
-def test_a_network_that_grows_keeps_the_opacities_and_colors_it_has_learnt(more):
-    old, new = grown(free=DECODER.free + more)
-    variables, inputs = random_variables(old, 3), random_inputs()
-    before, _ = apply_humangs(variables, inputs, old)
-    after, _ = apply_humangs(fit_variables(variables, old, new), inputs, new)
-    per_vertex = lambda outputs, config: np.asarray(outputs.gaussians.opacities).reshape(
-        -1, config.architecture.decoder.gaussians_per_vertex
-    )
-    a, b = per_vertex(before, old), per_vertex(after, new)
-    both = min(a.shape[1], b.shape[1])
-    assert np.allclose(a[:, :both], b[:, :both], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_geometry_starts_anew_in_another_frame_alone():
-    old, new = grown()
-    variables = random_variables(old, 3)
-    geometry = lambda tree: np.asarray(tree["params"]["decoder"]["geometry_out"]["kernel"])
-    assert np.abs(geometry(fit_variables(variables, old, new))).max() < 0.01 < np.abs(geometry(variables)).max()
-    frame = old.with_parts(decoder=dataclasses.replace(DECODER, frame="normal"))
-    assert np.array_equal(geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame)))
-
-
-def test_fitting_to_the_same_network_changes_nothing():
-    same = fit_variables(VARIABLES, TINY, TINY)
-    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (same, VARIABLES)), strict=True))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"reader": dataclasses.replace(READER, shells=(0.0, 0.2))}, "shells"),
-        ({"decoder": dataclasses.replace(DECODER, tight=2)}, "decoder.tight 1"),
-        ({"decoder": dataclasses.replace(DECODER, residual_color=False), "reader": NO_RGB}, "sample_rgb True"),
-        ({"decoder": dataclasses.replace(DECODER, hidden=24)}, "decoder/"),
-        ({"encoder": encoder(transformer=dataclasses.replace(ENCODER.transformer, layers=6))}, "block_4"),
-        ({"encoder": encoder(texture=dataclasses.replace(ENCODER.texture, resolution=4))}, "texture"),
-    ],
-)
-def test_networks_that_differ_more_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        fit_variables(VARIABLES, TINY, TINY.with_parts(**changes))
