@@ -23,23 +23,12 @@ from humangs_jax.people.writer import Layout, write_person
 
 ASSETS = REPOSITORY / "humangs_jax" / "assets"
 PACKAGE = "@mediapipe/pose@0.5.1675469404"
+DETECTION, LANDMARKS = "pose_detection.tflite", "pose_landmark_heavy.tflite"
 FILES = {
-    "pose_solution_packed_assets.data": (
-        "pose_detection.tflite",
-        "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85",
-    ),
-    "pose_landmark_heavy.tflite": (
-        "pose_landmark_heavy.tflite",
-        "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
-    ),
+    "pose_solution_packed_assets.data": (DETECTION, "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85"),
+    LANDMARKS: (LANDMARKS, "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe"),
 }
 """Of the package: our name, and the SHA-256 sum."""
-
-
-def fetched(folder: Path) -> Path:
-    """The archive, from npm."""
-    result = subprocess.run(["npm", "pack", "--silent", PACKAGE], cwd=folder, check=True, capture_output=True, text=True)
-    return folder / result.stdout.strip().splitlines()[-1]
 
 
 def checked(package: Path) -> dict[str, bytes]:
@@ -65,7 +54,11 @@ def build_blazepose(run: Run, out: Path = ASSETS / "blazepose", package: Path | 
     package: the package's archive (`npm pack`); default: npm fetches it
     """
     with tempfile.TemporaryDirectory() as folder:
-        contents = checked(package or fetched(Path(folder)))
+        if package is None:
+            command = ["npm", "pack", "--silent", PACKAGE]
+            result = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
+            package = Path(folder) / result.stdout.strip().splitlines()[-1]
+        contents = checked(package)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         (out / name).write_bytes(content)
@@ -121,7 +114,7 @@ def build():
     rotations = np.zeros((FRAMES, len(JOINT_NAMES), 3))
     for frame in range(FRAMES):
         for name, matrix in frame_rotations(frame).items():
-            rotations[frame, JOINT_NAMES.index(name)] = _axis_angle(matrix)
+            rotations[frame, JOINT_NAMES.index(name)] = Rotation.from_matrix(matrix).as_rotvec()
     stride = 2 * np.pi * STRIDES * np.arange(FRAMES) / FRAMES
     translations = np.stack([0.018 * np.sin(stride), np.zeros(FRAMES), 0.006 * np.sin(2 * stride)], axis=-1)
     lowest = jax.jit(lambda pose: pose_body(body, rest, pose).vertices[:, 1].min())
@@ -185,12 +178,8 @@ def _waving(frame, shoulder, collar, elbow, wrist):
     rise = _smooth((frame - WAVE_BEGIN) / (WAVE_UP - WAVE_BEGIN))
     up = rise * (1 - _smooth((frame - WAVE_DOWN) / (WAVE_END - WAVE_DOWN)))
     wave = np.sin(2 * np.pi * (frame - WAVE_UP) / 9.0)
-    raised = (
-        _y(24) @ _z(32) @ _x(-75),  # upper arm a little below the shoulder, to the side and forward
-        _z(-4),
-        _y(108 + 17 * wave),
-        _y(9 * wave),
-    )
+    # upper arm a little below the shoulder, to the side and forward
+    raised = _y(24) @ _z(32) @ _x(-75), _z(-4), _y(108 + 17 * wave), _y(9 * wave)
     blend = [_between(a, b, up) for a, b in zip((shoulder, collar, elbow, wrist), raised, strict=True)]
     return (*blend, 1 - 0.85 * up)
 
@@ -207,35 +196,14 @@ def _curve(keys: dict, phase: float) -> float:
     return float(CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0))
 
 
-def _rotation(axis: int, degrees: float):
-
-    vector = np.zeros(3)
-    vector[axis] = np.radians(degrees)
-    return _matrix(vector)
+def _about(axis: int):
+    """Degrees -> the rotation matrix."""
+    return lambda degrees: Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
 
 
-def _x(degrees: float):
-    return _rotation(0, degrees)
-
-
-def _y(degrees: float):
-    return _rotation(1, degrees)
-
-
-def _z(degrees: float):
-    return _rotation(2, degrees)
-
-
-def _matrix(axis_angle):
-
-    return Rotation.from_rotvec(axis_angle).as_matrix()
-
-
-def _axis_angle(matrix):
-
-    return Rotation.from_matrix(matrix).as_rotvec()
+_x, _y, _z = map(_about, range(3))
 
 
 def _between(a, b, share: float):
     """From rotation a towards b, along the shortest way."""
-    return a @ _matrix(share * _axis_angle(a.T @ b))
+    return a @ Rotation.from_rotvec(share * Rotation.from_matrix(a.T @ b).as_rotvec()).as_matrix()

