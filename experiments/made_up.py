@@ -38,16 +38,14 @@ BACKGROUND = 0.45
 """Grey of the room behind the people of videos."""
 
 
-def directions_of(people: Sequence[Any], body: Any) -> np.ndarray:
-    """(n, 3, 20) shape directions of a model file, in which person i has betas e_i; no expressions."""
-    directions = np.zeros((len(body.template), 3, 2 * COLUMNS), np.float32)
+def write_body(path: Path, people: Sequence[Any], body: Any, hand_poses: np.ndarray) -> dict[str, np.ndarray]:
+    """The package's body as an SMPL-X model file, in which person i has betas e_i, and its arrays.
+
+    hand_poses: (people, 2, 45) that 12 components reach.
+    """
+    directions = np.zeros((len(body.template), 3, 2 * COLUMNS), np.float32)  # shapes, no expressions
     for i, person in enumerate(people):
         directions[..., i] = np.asarray(body.shape_directions) @ person.betas
-    return directions
-
-
-def write_body(path: Path, people: Sequence[Any], body: Any, hand_poses: np.ndarray) -> dict[str, np.ndarray]:
-    """The package's body as an SMPL-X model file, and its arrays. hand_poses: (people, 2, 45) that 12 components reach."""
     rng = np.random.default_rng(7)
     means = 0.2 * rng.normal(size=(2, 45))
     components = rng.normal(size=(2, 45, 45))
@@ -55,17 +53,13 @@ def write_body(path: Path, people: Sequence[Any], body: Any, hand_poses: np.ndar
         components[:, i] = hands - means  # person i's hands are component i
     more = {f"hands_mean{side}": means[i] for i, side in enumerate("lr")}
     more |= {f"hands_components{side}": components[i] for i, side in enumerate("lr")}
-    return write_smplx(path, body, directions_of(people, body), **more)
+    return write_smplx(path, body, directions, **more)
 
 
-def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list[Any], Any, Any]:
-    """Synthetic people, the body that they are made of, and the one of the model file: decimated to `vertices`."""
+def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list[Any], Any]:
+    """Synthetic people, and the body of the model file: that which they are made of, decimated to `vertices`."""
     body = load_body()
-    return (
-        [in_tight_clothes(seed, body) for seed in seeds],
-        body,
-        body if vertices is None else decimate(body, vertices),
-    )
+    return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(body, vertices)
 
 
 def in_tight_clothes(seed: int, body: Any) -> Any:
@@ -86,14 +80,11 @@ def in_tight_clothes(seed: int, body: Any) -> Any:
     return make_subject(seed, body, dataclasses.replace(person, garments=worn, haircut=haircut))
 
 
-def fitted_vertices(body_file: Path, parameters: Any) -> np.ndarray:
-    """(n, 3) vertices of the model file in the first pose."""
-    return next(posed_people(FileBody.load(body_file).model, parameters)).vertices
-
-
-def unit(i: int) -> np.ndarray:
-    """Shape coefficients of person i."""
-    return np.eye(COLUMNS)[i]
+def placed(rotations: np.ndarray, translations: np.ndarray, world: np.ndarray, arrays: dict[str, np.ndarray], i: int) -> Any:
+    """Parameters of person i of a model file in another world."""
+    shape = np.eye(2 * COLUMNS)[i]
+    rest = arrays["v_template"] + arrays["shapedirs"] @ shape
+    return turned(BodyParameters(shape, rotations, translations), world, arrays["J_regressor"][0] @ rest)
 
 
 # THuman ---------------------------------------------------------------------------------------------------------------
@@ -106,7 +97,7 @@ def write_thuman(
 
     Scans stand in a world of their own: turned, moved, and in other units for each person.
     """
-    people, _, small = make_people(seeds, vertices)
+    people, small = make_people(seeds, vertices)
     posed = [sample_pose(person, 1) for person in people]
     hands = np.stack([[p.rotations[part].reshape(-1) for part in HANDS] for p in posed])
     arrays = write_body(out / "body.npz", people, small, hands)
@@ -117,12 +108,9 @@ def write_thuman(
         points = scale * (pose.vertices @ matrix[:3, :3].T + matrix[:3, 3])[baked.atlas.vertices]
         folder = out / "thuman" / "model" / name
         write_scan(folder, name, points, baked.atlas.uvs, baked.atlas.faces, lit_texture(pose, baked))
-        shape = np.concatenate([unit(i), np.zeros(COLUMNS)])
-        parameters = BodyParameters(shape, pose.rotations[None].astype(float), pose.translation[None].astype(float))
-        rest = arrays["v_template"] + arrays["shapedirs"] @ shape
-        parameters = turned(parameters, matrix, arrays["J_regressor"][0] @ rest)
+        parameters = placed(pose.rotations[None].astype(float), pose.translation[None].astype(float), matrix, arrays, i)
         fit = fit_values(parameters, kinds[i % len(kinds)], scale, arrays, i)
-        mesh = scale * fitted_vertices(out / "body.npz", parameters)
+        mesh = scale * next(posed_people(FileBody.load(out / "body.npz").model, parameters)).vertices
         write_fit(out / "thuman" / "smplx" / name, fit, mesh, arrays["f"])
     return out / "thuman"
 
@@ -191,7 +179,7 @@ class Video:
         size: tuple[int, int] = (150, 204),
         vertices: int | None = None,
     ):
-        people, _, small = make_people([seed], vertices)
+        people, small = make_people([seed], vertices)
         motion = sample_motion(people[0], 30, "walk")
         rows = np.linspace(0, 29, frames).round().astype(int)
         rotations, translations = (np.asarray(x, np.float64)[rows] for x in (motion.rotations, motion.translations))
@@ -199,10 +187,7 @@ class Video:
         hands = rotations[:1, 25:].reshape(1, 2, 45)
         arrays = write_body(out / "body.npz", people, small, hands)
         world = random_rigid(np.random.default_rng(seed))
-        shape = np.concatenate([unit(0), np.zeros(COLUMNS)])
-        rest = arrays["v_template"] + arrays["shapedirs"] @ shape
-        known = BodyParameters(shape, rotations, translations)
-        self.parameters = turned(known, world, arrays["J_regressor"][0] @ rest)
+        self.parameters = placed(rotations, translations, world, arrays, 0)
         number = lambda x: np.asarray(x, np.float32)
         self.posed = [pose_subject(people[0], number(r), number(t)) for r, t in zip(rotations, translations, strict=True)]
         self.cameras = self._around(cameras, size)
