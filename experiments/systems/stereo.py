@@ -20,22 +20,17 @@ import numpy as np
 from experiments.systems.pixel_queries import no_gaussians
 from experiments.systems.targets import drawn, reconstructed
 from experiments.systems.unet import UNet, check_scales
-from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.configuration import Few, Spread, Width, part
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera, pixel_rays
-from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.maps import sample_bilinear, texel_indices
-from humangs_jax.network.parts import Decoder, Drawn, Driver, HumanGSInputs, HumanGSOutputs, Pass, Target, Variables, subject_unit
+from humangs_jax.network.parts import Decoder, Drawn, Driver, HumanGSInputs, HumanGSOutputs, Pass, Target, subject_unit
 from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import draw_posed
 
 CHANNELS = 4, 3, 1
@@ -134,24 +129,13 @@ class NearestPairDriver(Driver):
         return outputs
 
     @nn.nowrap
-    def draw(
-        self,
-        variables: Variables,
-        outputs: HumanGSOutputs,
-        body: BodyModel,
-        photos: SubjectViews,
-        targets: SubjectViews,
-        backgrounds: Float[Array, "v 3"],
-        config: TrainConfig,
-    ) -> Drawn:
+    def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         """See `parts.Driver`."""
         posed = jax.vmap(lambda center: nearest_pair(outputs.scene, center))(targets.cameras.center)
         return draw_posed(posed, targets, backgrounds, config)._replace(opacities=posed.opacities.reshape(-1))
 
     @nn.nowrap
-    def show(
-        self, variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float
-    ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"]]:
+    def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
         """See `parts.Driver`. The pose of a target changes nothing; their world has to be y-up."""
         scene = reconstructed(variables, config, inputs)[0].scene
         return drawn((nearest_pair(scene, center) for center in targets.cameras.center), targets.cameras, background, config)

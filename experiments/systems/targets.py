@@ -29,7 +29,6 @@ from humangs_jax.network.parts import Drawn, Driver, HumanGSOutputs, Target, Var
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import Rendering
-from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import draw_posed
 
 
@@ -52,16 +51,7 @@ class GaussianDriver(Driver):
         return skin(make_avatar(driven, body, shape_body(body, betas), config), pose), driven
 
     @nn.nowrap
-    def draw(
-        self,
-        variables: Variables,
-        outputs: HumanGSOutputs,
-        body: BodyModel,
-        photos: SubjectViews,
-        targets: SubjectViews,
-        backgrounds: Float[Array, "v 3"],
-        config: TrainConfig,
-    ) -> Drawn:
+    def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         """See `parts.Driver`."""
 
         def one(pose):
@@ -74,9 +64,7 @@ class GaussianDriver(Driver):
         return found._replace(opacities=flat(posed.opacities), tight_offsets=flat(offsets))
 
     @nn.nowrap
-    def show(
-        self, variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float
-    ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"]]:
+    def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
         """See `parts.Driver`. Their world has to be y-up, unlike that of `reconstruct`."""
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own = part_variables(variables, "driver")
@@ -94,12 +82,7 @@ class PixelDriver(Driver):
 
     @nn.nowrap
     def images(
-        self,
-        variables: Variables,
-        outputs: HumanGSOutputs,
-        body: BodyModel,
-        targets: SubjectViews,
-        config: HumanGSConfig,
+        self, variables: Variables, outputs: HumanGSOutputs, body: BodyModel, targets: SubjectViews, config: HumanGSConfig
     ) -> Float[Array, "v h w 3"]:
         """Of targets, a pass each; their photos and masks are not used. What is too much of a whole patch is cut off."""
         vertices, pixels = target_queries(body, targets, config)
@@ -112,25 +95,14 @@ class PixelDriver(Driver):
         return jax.lax.map(one, arguments)[:, : targets.cameras.height, : targets.cameras.width]
 
     @nn.nowrap
-    def draw(
-        self,
-        variables: Variables,
-        outputs: HumanGSOutputs,
-        body: BodyModel,
-        photos: SubjectViews,
-        targets: SubjectViews,
-        backgrounds: Float[Array, "v 3"],
-        config: TrainConfig,
-    ) -> Drawn:
+    def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         """See `parts.Driver`; alpha 1 and depth 0 everywhere."""
         images = self.images(variables, outputs, body, targets, config.model)
         full = lambda rgb: Rendering(rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32))
         return Drawn(jax.vmap(full)(images))
 
     @nn.nowrap
-    def show(
-        self, variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float
-    ) -> tuple[Float[np.ndarray, "v h w 3"], None]:
+    def show(self, variables, config, inputs, targets, background) -> tuple[np.ndarray, None]:
         """See `parts.Driver`. Raises: ValueError for another background than white."""
         if background != 1:
             raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
