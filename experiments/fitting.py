@@ -225,12 +225,7 @@ CASES = {
 
 
 @entry
-def fit_sequences(
-    run: Run,
-    smoothness: tuple[float, ...] = (0.005, 0.02),
-    people: int = 3,
-    cases: tuple[str, ...] = (),
-) -> None:
+def fit_sequences(run: Run, smoothness: tuple[float, ...] = (0.005, 0.02), people: int = 3, cases: tuple[str, ...] = ()) -> None:
     """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the shipped walk with known keypoints.
 
     Mean error over all 55 joints of the frames that the case leaves alone and of those that it spoils, and of the joints'

@@ -45,10 +45,7 @@ COLUMNS = {  # heading and digits
 
 @entry
 def evaluation_views(
-    run: Run,
-    people: People = People(32),
-    views: tuple[int, ...] = (1, 2, 4, 6),
-    plot: Path | None = None,
+    run: Run, people: People = People(32), views: tuple[int, ...] = (1, 2, 4, 6), plot: Path | None = None
 ) -> None:
     """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in others.
 

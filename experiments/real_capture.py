@@ -118,10 +118,7 @@ class VideoCamera(NamedTuple):
         k1, k2, p1, p2 = self.distortion
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + k2 * r2)
-        bent = (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
+        bent = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
         return np.stack(bent, axis=-1) * focal + middle
 
     def undistorted(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:

@@ -15,17 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.real_capture import (
-    CAMERAS,
-    DEMO,
-    FRAMES,
-    SIZE,
-    RealFrame,
-    body_ious,
-    largest_person,
-    prepare,
-    read_frames,
-)
+from experiments.real_capture import CAMERAS, DEMO, FRAMES, SIZE, RealFrame, body_ious, largest_person, prepare, read_frames
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
@@ -77,10 +67,7 @@ def without_calibration(
     pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
     world = pick(frame.world)
     keypoints = dataclasses.replace(
-        keypoints,
-        points=pick(keypoints.points),
-        confidences=pick(keypoints.confidences),
-        world=world.astype(np.float32),
+        keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences), world=world.astype(np.float32)
     )
     return frame._replace(cameras=stack_cameras(cameras), keypoints=keypoints, world=world, moments=found.moments > 1)
 

@@ -98,11 +98,7 @@ def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
 def pages(repository: Path | None = None) -> list[Path]:
     """README.md, all pages of the docs, and that of the experiments."""
     repository = repository or REPOSITORY
-    found = [
-        repository / "README.md",
-        repository / "experiments" / "README.md",
-        *sorted((repository / "docs").rglob("*.md")),
-    ]
+    found = [repository / "README.md", repository / "experiments" / "README.md", *sorted((repository / "docs").rglob("*.md"))]
     return [page for page in found if page.is_file()]
 
 
@@ -119,13 +115,7 @@ def page_of(name: str) -> Path:
     return found[0]
 
 
-def publish(
-    page: Path,
-    name: str,
-    text: str,
-    numbers: object = None,
-    record: dict[str, Any] | None = None,
-) -> None:
+def publish(page: Path, name: str, text: str, numbers: object = None, record: dict[str, Any] | None = None) -> None:
     """Writes docs/results/NAME.json, and the page's section of that name.
 
     record: what made it, by default this process (`run_record`).

@@ -217,11 +217,7 @@ def largest_weights(scene: Scene) -> np.ndarray:
 
 @entry
 def splatting_tradeoff(
-    run: Run,
-    size: int = 512,
-    repeats: int = 7,
-    only: tuple[str, ...] = (),
-    image: Path | None = None,
+    run: Run, size: int = 512, repeats: int = 7, only: tuple[str, ...] = (), image: Path | None = None
 ) -> None:
     """What each knob of the splatting renderer gains in time and costs in accuracy, on the shipped person.
 

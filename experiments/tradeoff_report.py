@@ -45,10 +45,7 @@ def points() -> list[Point]:
     found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
     found += [point(f"frames of {n}", "frame size", size=n) for n in (128, 256, 1024)]
-    found += [
-        point("pruned", "Gaussians", prune=True),
-        point("vertex-color baseline", "naive", start="vertex-color baseline"),
-    ]
+    found += [point("pruned", "Gaussians", prune=True), point("vertex-color baseline", "naive", start="vertex-color baseline")]
     found += [point(f"{n} steps", "refinement", refine_steps=n, refine_size=256) for n in (100, 200)]
     for n in (0, 200):
         random: dict[str, Any] = {"refine_steps": n, "refine_size": 256}
@@ -65,11 +62,7 @@ def points() -> list[Point]:
     return found
 
 
-ITERATIONS = (
-    *((n, 0, 256) for n in (1, 2, 3, 4, 6)),
-    (4, 100, 256),
-    *((4, steps, 512) for steps in (0, 100)),
-)
+ITERATIONS = (*((n, 0, 256) for n in (1, 2, 3, 4, 6)), (4, 100, 256), *((4, steps, 512) for steps in (0, 100)))
 """Of the learned update, steps of Adam after them, and the size of the photos."""
 
 

@@ -61,12 +61,7 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
         K[:2, 2] -= 0.5  # OpenCV counts pixels, also in keypoints
         matrix = matrix @ OPENCV_FROM_Y_UP
         size = [capture.cameras.width, capture.cameras.height]
-        calibration[name] = {
-            "K": K.tolist(),
-            "R": matrix[:3, :3].tolist(),
-            "T": matrix[:3, 3].tolist(),
-            "imgSize": size,
-        }
+        calibration[name] = {"K": K.tolist(), "R": matrix[:3, :3].tolist(), "T": matrix[:3, 3].tolist(), "imgSize": size}
         known = np.isfinite(points[i]).all(-1)
         person = {"keypoints": np.where(known[:, None], points[i] - 0.5, 0).tolist()}
         person["keypoint_scores"] = np.where(known, 0.9, 0.0).tolist()

@@ -255,9 +255,7 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
 
 @entry
 def parity(
-    run: Run,
-    checkpoints: tuple[Path, ...],
-    dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
+    run: Run, checkpoints: tuple[Path, ...], dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",)
 ) -> int:
     """Checkpoints of the published network on stored inputs: the largest error of every stage, relative to its largest magnitude.
 

@@ -50,13 +50,7 @@ VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
 
 
 @entry
-def paper(
-    run: Run,
-    out: Path,
-    only: tuple[str, ...] = (),
-    train: bool = True,
-    quick: bool = False,
-) -> None:
+def paper(run: Run, out: Path, only: tuple[str, ...] = (), train: bool = True, quick: bool = False) -> None:
     """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets its criterion.
 
     What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in OUT: the same command goes on

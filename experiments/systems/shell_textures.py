@@ -23,16 +23,7 @@ from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.maps import sample_bilinear, sample_nearest, texel_indices
-from humangs_jax.network.parts import (
-    Decoder,
-    Encoder,
-    Encoding,
-    HumanGSInputs,
-    HumanGSOutputs,
-    Pass,
-    Reader,
-    subject_unit,
-)
+from humangs_jax.network.parts import Decoder, Encoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, subject_unit
 from humangs_jax.network.reader import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians

@@ -36,16 +36,7 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.maps import sample_bilinear, texel_indices
-from humangs_jax.network.parts import (
-    Decoder,
-    Encoding,
-    HumanGSInputs,
-    HumanGSOutputs,
-    Pass,
-    Reader,
-    Target,
-    subject_unit,
-)
+from humangs_jax.network.parts import Decoder, Encoding, HumanGSInputs, HumanGSOutputs, Pass, Reader, Target, subject_unit
 from humangs_jax.network.reader import UNSEEN_COLOR, project_vertices, visible_vertices
 from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians

@@ -92,11 +92,7 @@ class TwoStreamBlock(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        points: Float[Array, "n d"],
-        tokens: Float[Array, "l d"],
-        count: Int[Array, ""] | None,
-        pooled: Float[Array, " d"],
+        self, points: Float[Array, "n d"], tokens: Float[Array, "l d"], count: Int[Array, ""] | None, pooled: Float[Array, " d"]
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
         dtype, width, vertices = self.runtime.compute_dtype, self.width, len(points)
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
