@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
+import numpy as np
 import tyro
 
 from humangs_jax.body.library import load_body
@@ -76,7 +77,8 @@ def main(
     body, variables = load_body(), None
     if init_weights is not None:
         variables, _ = load_weights(None if init_weights == "shipped" else init_weights)
-        variables = variables_from_tensors(flatten_variables(variables), config.model, str(init_weights))
+        tensors = {key: np.asarray(tensor) for key, tensor in flatten_variables(variables).items()}
+        variables = variables_from_tensors(tensors, config.model, str(init_weights))
     if validation is None:
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")

@@ -25,7 +25,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.config import Architecture
 from humangs_jax.network.humangs import apply_humangs, part_variables
-from humangs_jax.network.parts import Driver, Encoding, Target
+from humangs_jax.network.parts import Encoding, Target
 from humangs_jax.network.reader import project_vertices
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
 from humangs_jax.rendering.gaussians import Gaussians
@@ -295,12 +295,13 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     inputs = replace(inputs, images=images, depth_maps=0 * inputs.depth_maps + 100.0)
     config = small("giga")
     colors = {}
-    for sharpness in (0.0, 2.0, 4.0):
+    for sharpness in (2.0, 4.0):
         reader = dataclasses.replace(config.architecture.reader, sharpness=sharpness)
-        colors[sharpness] = reader.apply({}, Encoding(images, None, jnp.int32(0)), inputs, config.run()).colors
+        read = lambda inputs, reader=reader: reader.apply({}, Encoding(inputs.images, None, jnp.int32(0)), inputs, config.run())
+        colors[sharpness] = jax.jit(read)(inputs).colors
     red = lambda sharpness: np.asarray(colors[sharpness][..., 0]).ravel()
-    both = (red(0.0) > 0.49) & (red(0.0) < 0.51) & (np.asarray(colors[0.0][..., 2]).ravel() < 0.1)
-    assert both.sum() > 3  # without sharpness both count the same
+    both = (red(4.0) > 1e-4) & (red(4.0) < 1 - 1e-4) & (np.asarray(colors[4.0][..., 2]).ravel() < 0.1)
+    assert both.sum() > 3
     odds = lambda sharpness: np.log(red(sharpness)[both] / (1 - red(sharpness)[both]))
     assert np.abs(odds(2.0)).max() > 0.1
     np.testing.assert_allclose(odds(4.0), 2 * odds(2.0), atol=1e-3)  # log odds grow in proportion
@@ -372,12 +373,11 @@ def test_a_pair_of_photos_has_finite_gradients_and_shows_no_other_pose():
 # Parts ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*PIXELS, *DRIVEN])
-def test_architectures_are_recorded_whole(name):
-    architecture = small(name).architecture
-    assert config_from_json(Architecture, config_to_json(architecture)) == architecture
-    assert isinstance(architecture.driver, PixelDriver) == (not architecture.driver.has_alpha) == (name in PIXELS)
-    assert isinstance(architecture.driver, Driver)
+def test_architectures_are_recorded_whole():
+    for name in (*PIXELS, *DRIVEN):
+        architecture = small(name).architecture
+        assert config_from_json(Architecture, config_to_json(architecture)) == architecture
+        assert isinstance(architecture.driver, PixelDriver) == (not architecture.driver.has_alpha) == (name in PIXELS)
 
 
 def test_parts_that_do_not_fit_are_refused():
@@ -394,18 +394,14 @@ def test_parts_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=r"(SurfaceMap.size|driver.widths|CorrectionMLP.layers).*expected 1 to"):
             wrong()
+    config, target = small("lca"), Target(pose(), tube().template)
+    outputs, run = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lca"), config)[0], random_variables(config)), config.run()
     for driver, said in (
         (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),
         (CorrectionMLP(8, 1, joints=2, gaussians_per_vertex=2), r"driver\.gaussians_per_vertex 2: the decoder gives"),
     ):
-        other, inputs = small("lca").with_parts(driver=driver), inputs_of("lca")
-
-        def frame(other=other, inputs=inputs):
-            variables = random_variables(other)
-            return frame_outputs(variables, apply_humangs(variables, inputs, other)[0], tube(), pose(), other)
-
         with pytest.raises(ValueError, match=said):
-            jax.eval_shape(frame)
+            jax.eval_shape(functools.partial(driver.init, run=run), jax.random.key(0), outputs, target)
     with pytest.raises(ValueError, match="works on a map of the surface"):
         mapless = replace(inputs_of("animatable"), texels=None)
         jax.eval_shape(lambda: apply_humangs({}, mapless, small("animatable"))[0])

@@ -1,6 +1,5 @@
 """The commands that train the shipped weights."""
 
-import functools
 import typing
 from pathlib import Path
 
@@ -12,9 +11,8 @@ import tyro
 
 from experiments import train_by_clock, train_shipped
 from humangs_jax.core.pytree import replace
-from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
-from humangs_jax.network.weights import load_weights, save_weights
+from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.training.config import tiny as tiny_run
 from humangs_jax.training.state import TrainState
 
@@ -33,10 +31,8 @@ def test_the_shipped_weights_have_a_name(given, expected):
 
 
 def test_the_mean_of_the_first_and_the_trained_weights(tmp_path):
-    shapes = jax.eval_shape(functools.partial(init_humangs, config=tiny()), jax.random.key(0))
     random = np.random.default_rng(0)
-    made = lambda leaf: random.normal(size=leaf.shape).astype(leaf.dtype)
-    first, last = jax.tree.map(made, shapes), jax.tree.map(made, shapes)
+    first, last = (jax.tree.map(lambda x: random.normal(size=x.shape), expected_variables(tiny())) for _ in range(2))
     save_weights(tmp_path / "weights.safetensors", last, tiny())
     train_shipped.write_mean(tmp_path, first, 0.25)
     mean, model = load_weights(tmp_path / "mean.safetensors")
