@@ -22,7 +22,6 @@ from humangs_jax.fitting.landmark_fit import (
     FEW,
     MOTION_SCALE,
     ROBUST_SCALES,
-    STAGES,
     LandmarkFit,
     accelerations,
     fit_landmarks,
@@ -31,7 +30,6 @@ from humangs_jax.fitting.landmark_fit import (
 from humangs_jax.fitting.report import (
     Change,
     FitReport,
-    Stage,
     ViewReport,
     keypoint_warnings,
     limit_violations,
@@ -46,7 +44,7 @@ from humangs_jax.fitting.residuals.keypoints import (
     group_by_frame,
     keypoint_errors,
 )
-from humangs_jax.fitting.swaps import Swap, find_mirrored, find_swaps
+from humangs_jax.fitting.swaps import find_swaps
 
 UNSEEN = 1e-8
 """Least information about position and orientation; keeps the inverse finite for frames without keypoints."""
@@ -130,27 +128,22 @@ REMEDIES = "`humangs fit` turns it back", "give its photos to other frames"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
-    """The report on a body and keypoints, and the arrays behind it, of v views, m frames and k keypoints.
+    """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints.
 
-    frames: (m,) median error, pixels, NaN where no view has keypoints. noise: (m,) std of the keypoints, pixels. landmarks:
-    (v, k, 2) of the body, pixels. compared, outliers: (v, k).
+    landmarks: (v, k, 2) of the body, pixels. compared, outliers: (v, k).
     """
 
     report: FitReport
-    frames: Float[np.ndarray, " m"]
-    noise: Float[np.ndarray, " m"]
     landmarks: Float[np.ndarray, "v k 2"]
     compared: Bool[np.ndarray, "v k"]
     outliers: Bool[np.ndarray, "v k"]
 
 
-def examine(
-    capture: Capture, keypoints: Keypoints, record: FitRecord | None = None, mirrored: tuple[Swap, ...] = ()
-) -> Examination:
+def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
     """Compare the body of a capture with keypoints of its views, in the order of the views.
 
     Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the median error), and what
-    the views determine. mirrored: result of `find_mirrored`.
+    the views determine.
     Raises: ValueError if the number of views differs, the record is of fewer frames, or the body has none of the landmarks.
     """
     if len(keypoints.points) != capture.view_count:
@@ -180,7 +173,7 @@ def examine(
     numbers = zip(capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True)
     rows = tuple(_view_report(*own) for own in numbers)
     violations = limit_violations(names, poses)
-    swaps = (*mirrored, *find_swaps(observations, kind, views, capture.names))
+    swaps = find_swaps(observations, kind, views, capture.names)
     report = FitReport(
         fitted="keypoints",
         errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
@@ -195,7 +188,7 @@ def examine(
         ),
     )
     landmarks = by_view(errors + np.asarray(observations.points))
-    return Examination(report, frames, noise, landmarks, by_view(compared), by_view(outliers))
+    return Examination(report, landmarks, by_view(compared), by_view(outliers))
 
 
 @jax.jit
@@ -235,37 +228,24 @@ FAR = 4.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """A fit in memory: the capture with its body, the record that is stored beside it, and what the solver did.
+    """A fit in memory: the capture with its body, and the record that is stored beside it.
 
-    camera_errors: turns of cameras, which the capture's are without.
+    notes, warnings: of the fit itself. camera_errors: turns of cameras, which the capture's are without.
     """
 
     capture: Capture
     record: FitRecord
     fit: LandmarkFit
-    model: LandmarkModel
-    observations: Observations
-    smoothness: float
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
     camera_errors: tuple[CameraError, ...] = ()
 
     @functools.cached_property
     def report(self) -> FitReport:
-        """How good it is. Made when asked for: it fits the mirrored keypoints and tries exchanges of views."""
-        keypoints, fit = self.record.keypoints, self.fit
-        mirrored = find_mirrored(self.model, self.observations, keypoints.set, fit)
-        report = examine(self.capture, keypoints, self.record, mirrored).report
-        seen = np.asarray(self.observations.confidences) * np.asarray(self.model.known) > 0
-        smooth = "motion" in fit.outcomes
-        names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
-        stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
-        warnings = (
-            *report.warnings,
-            *_blind_frames(seen, smooth),
-            *_motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), self.smoothness),
-        )
-        turned = (f"{error}: turned back" for error in self.camera_errors)
-        notes = (*report.notes, *_places(self.model, fit), *turned)
-        return dataclasses.replace(report, stages=stages, notes=notes, warnings=warnings)
+        """How good it is. Made when asked for: it tries exchanges of views."""
+        report = examine(self.capture, self.record.keypoints, self.record).report
+        notes, warnings = (*report.notes, *self.notes), (*report.warnings, *self.warnings)
+        return dataclasses.replace(report, notes=notes, warnings=warnings)
 
 
 def fit_photos(
@@ -293,7 +273,8 @@ def fit_photos(
     kind = keypoints.set
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     observations, _ = group_by_frame(photos, keypoints)
-    if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
+    seen = np.asarray(observations.confidences) * np.asarray(model.known) > 0
+    if not seen.any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
     fit = fit_landmarks(model, observations, smoothness)
     found = fit_uncertainty(model, observations, fit)
@@ -304,7 +285,10 @@ def fit_photos(
     keypoints = dataclasses.replace(keypoints, set=kind.adapted(kind.offsets + moved, np.asarray(fit.certainty)))
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
-    return FittedCapture(capture, record, fit, model, observations, smoothness, errors)
+    notes = (*_places(model, fit), *(f"{error}: turned back" for error in errors))
+    motion = _motion_warnings(np.asarray(fit.joints, float), float(fit.smoothness), smoothness)
+    warnings = (*_blind_frames(seen, smoothness > 0 and len(seen) > 2), *motion)
+    return FittedCapture(capture, record, fit, notes, warnings, errors)
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:

@@ -43,7 +43,6 @@ from humangs_jax.fitting.residuals.keypoints import (
 from humangs_jax.fitting.state import (
     FREE,
     FitState,
-    Outcome,
     betas_of,
     frame_axes,
     half_squares,
@@ -63,9 +62,8 @@ PLACED_FRAMES = 4
 """From so many frames on a fit finds where the detector sees its landmarks: fewer say too little about shape and places both."""
 USUAL_COUNT, LEAST_RATIO = 16, 0.5
 """Keypoints that what is usual counts for, and its least share, where the noise of a landmark is found."""
-STAGES = ("rigid", "points", "body", "hands")
 ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
-"""Of keypoint errors in these stages and in that of the person, standard deviations."""
+"""Of keypoint errors in the stages rigid, points, body, hands and person, standard deviations."""
 STARTS = (4, 2)
 """Orientations that are followed, for one view and for several."""
 STEPS = PERSON_STEPS = 150
@@ -78,10 +76,8 @@ TOLERANCE = 3e-4
 class LandmarkFit:
     """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j, 3) metres.
 
-    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin.
-    outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames, and "motion", one for
-    each of `MOTION_LEVELS`. smoothness: () the acceleration that the motion was held to, metres per frame squared; 0: to none.
-    certainty: (k,) of the landmarks.
+    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin. smoothness: () the
+    acceleration that the motion was held to, metres per frame squared; 0: to none. certainty: (k,) of the landmarks.
     """
 
     betas: Float[Array, " s"]
@@ -90,7 +86,6 @@ class LandmarkFit:
     joints: Float[Array, "m j 3"]
     noise: Float[Array, " m"]
     state: FitState
-    outcomes: dict[str, Outcome]
     smoothness: Float[Array, ""]
     certainty: Float[Array, " k"]
 
@@ -111,7 +106,7 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, smoothness: 
 def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
     """All stages but the motion."""
     problem = keypoint_problem(model)
-    states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
+    states = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
@@ -120,21 +115,15 @@ def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit
     places = jnp.zeros((groups, 3)) if many else None
     start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
     residuals = lambda state: _person_residuals(problem, observations, state)
-    state, outcomes["person"] = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
-    return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
+    state, _ = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+    return _result(problem, observations.noise, state, jnp.zeros(()))
 
 
-def _result(
-    problem: KeypointProblem,
-    noise: Float[Array, " m"],
-    state: FitState,
-    outcomes: dict[str, Outcome],
-    smoothness: Float[Array, ""],
-) -> LandmarkFit:
+def _result(problem: KeypointProblem, noise: Float[Array, " m"], state: FitState, smoothness: Float[Array, ""]) -> LandmarkFit:
     betas = betas_of(problem.origin, state)
     poses = _poses(problem, state)
     landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model_of(state), betas, pose))(poses)
-    return LandmarkFit(betas, poses, landmarks, joints, noise, state, outcomes, smoothness, problem.model.certainty)
+    return LandmarkFit(betas, poses, landmarks, joints, noise, state, smoothness, problem.model.certainty)
 
 
 def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
@@ -148,17 +137,22 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
     return KeypointProblem(model, prior, origin)
 
 
-def _fit_frame(problem: KeypointProblem, seen: Observations) -> tuple[FitState, dict[str, Outcome]]:
+def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
     """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
     several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
     starts = _rigid_starts(problem, seen, points, counts, STARTS[several])
     targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
     stages = _stages(problem, targets)
-    states, outcomes = jax.vmap(lambda start: _run_stages(problem, seen, start, stages))(starts)
-    best = jnp.argmin(outcomes.after[:, -1])
-    state, outcomes = jax.tree.map(lambda leaf: leaf[best], (states, outcomes))
-    return state, {name: jax.tree.map(lambda leaf, i=i: leaf[i], outcomes) for i, name in enumerate(STAGES)}
+
+    def run(state, stage):
+        weighted = replace(seen, confidences=seen.confidences * stage.views)
+        residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
+        return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
+
+    states, costs = jax.vmap(lambda start: jax.lax.scan(run, start, stages))(starts)
+    best = jnp.argmin(costs[:, -1])
+    return jax.tree.map(lambda leaf: leaf[best], states)
 
 
 # The start of a frame ------------------------------------------------------------------------------------------------
@@ -279,17 +273,6 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
 
-def _run_stages(problem: KeypointProblem, seen: Observations, start: FitState, stages: _Stage) -> tuple[FitState, Outcome]:
-    """All stages, each from the end of the one before. Returns the state and outcomes of each."""
-
-    def run(state, stage):
-        weighted = replace(seen, confidences=seen.confidences * stage.views)
-        residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
-        return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
-
-    return jax.lax.scan(run, start, stages)
-
-
 def _noise_found(problem: KeypointProblem, observations: Observations, states: FitState) -> Float[Array, " m"]:
     def of_frame(seen, state):
         lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)
@@ -374,16 +357,16 @@ def smooth_motion(
             motion = robust(accelerations(joints) / std, MOTION_SCALE)
             return _person_residuals(problem, seen, y) | {"motion": motion}
 
-        state, outcome = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+        state, _ = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
         good = jnp.all(costs(state) <= limit)
         kept, held = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, held))
-        return (state, kept, held), outcome
+        return (state, kept, held), None
 
     start = _bridged(problem, seen, fit.state)
     kept = jax.tree.map(lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state)
     carry = (start, kept, jnp.zeros(()))
-    (_, state, held), outcomes = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
-    return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, held)
+    (_, state, held), _ = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
+    return _result(problem, fit.noise, state, held)
 
 
 def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:

@@ -112,7 +112,7 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
     if len(seen.photos) >= FEWEST_WITHOUT:
         rests = [[v for v in every if v != out] for out in every]
         some = map(seen.select, rests)  # without a look for mirrored views
-        errors = [_try(_cleaned(each), _mirror(each), np.zeros(len(each.points), bool)).error for each in some]
+        errors = [_try(_cleaned(each), np.zeros(len(each.points), bool)).error for each in some]
         out = int(np.argmin(errors))
         if errors[out] < MOMENT_WITHOUT:
             found = cameras_of_moment(seen.select(rests[out]), height=height)
@@ -133,7 +133,7 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
     """
     _check(seen, height)
     seen = _cleaned(seen)
-    found = _with_mirrored(seen, _mirror(seen))
+    found = _with_mirrored(seen)
     rig = found.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
         raise ValueError(f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person")
@@ -146,10 +146,6 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
     views, every = tuple(range(len(cameras))), np.broadcast_to(landmarks, (len(cameras), *landmarks.shape))
     warnings = tuple(_warnings(seen, found.mirrored, height))
     return PersonCameras(views, cameras, every, found.mirrored, 1, medians, warnings)
-
-
-def _mirror(seen: PersonViews) -> Int[np.ndarray, " k"]:
-    return np.asarray([seen.names.index(mirrored_name(name)) for name in seen.names])
 
 
 # What is given -------------------------------------------------------------------------------------------------------
@@ -194,9 +190,10 @@ def _focal_lengths(seen: PersonViews) -> tuple[Float[np.ndarray, " c"], Float[np
     return np.where(known, seen.focal, usual * diagonals), std
 
 
-def _evidence(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
+def _evidence(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
     """Evidence with left and right of some views exchanged, and cameras to start from."""
     focal, std = _focal_lengths(seen)
+    mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
     pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
     points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
@@ -230,16 +227,15 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 # Cameras -------------------------------------------------------------------------------------------------------------
 
 
-def _with_mirrored(seen: PersonViews, mirror: Int[np.ndarray, " k"]) -> "_Trial":
+def _with_mirrored(seen: PersonViews) -> "_Trial":
     views = len(seen.points)
-    found = _try(seen, mirror, np.zeros(views, bool))
-    if views > 1:
-        found = _least(seen, mirror, found)
-    if views > 1 and found.error > DOUBTFUL:
-        found = min(found, _least(seen, mirror, _try(seen, mirror, np.ones(views, bool))), key=lambda each: each.cost)
-    if views > 1 and _handedness(found.rig.landmarks, seen.names) < 0:
-        found = _try(seen, mirror, ~found.mirrored)
-    return found
+    found = _try(seen, np.zeros(views, bool))
+    if views == 1:
+        return found
+    found = _least(seen, found)
+    if found.error > DOUBTFUL:
+        found = min(found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost)
+    return found if _handedness(found.rig.landmarks, seen.names) >= 0 else _try(seen, ~found.mirrored)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -261,18 +257,18 @@ class _Trial:
         return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
 
 
-def _least(seen: PersonViews, mirror: Int[np.ndarray, " k"], start: _Trial) -> _Trial:
+def _least(seen: PersonViews, start: _Trial) -> _Trial:
     """View after view is mirrored while that explains the landmarks clearly better."""
     while True:
-        trials = [_try(seen, mirror, start.mirrored ^ (np.arange(len(seen.points)) == v)) for v in range(len(seen.points))]
+        trials = [_try(seen, start.mirrored ^ (np.arange(len(seen.points)) == v)) for v in range(len(seen.points))]
         best = min(trials, key=lambda each: each.cost)
         if not best.cost < CLEARLY * start.cost:
             return start
         start = best
 
 
-def _try(seen: PersonViews, mirror: Int[np.ndarray, " k"], mirrored: Bool[np.ndarray, " c"]) -> _Trial:
-    evidence, start = _evidence(seen, mirror, mirrored)
+def _try(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> _Trial:
+    evidence, start = _evidence(seen, mirrored)
     return _Trial(mirrored, *adjust(evidence, start), evidence)
 
 

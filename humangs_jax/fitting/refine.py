@@ -30,26 +30,13 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, how_far, limit_violations
+from humangs_jax.fitting.report import Change, FitReport, ViewReport, how_far, limit_violations
+from humangs_jax.fitting.residuals import silhouettes
 from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, found_noise, keypoint_residuals, scaled_observations
-from humangs_jax.fitting.residuals.silhouettes import (
-    BodyView,
-    Boundary,
-    Matches,
-    body_boundary,
-    boundary_points,
-    distances,
-    mask_boundary,
-    match,
-    mesh_edges,
-    silhouette_residuals,
-    view_body,
-)
 from humangs_jax.fitting.state import (
     NORMAL_MAD,
     FitState,
     Origin,
-    Outcome,
     StateStd,
     betas_of,
     camera_origin,
@@ -180,7 +167,7 @@ class Evidence:
     """
 
     points: SurfacePoints
-    matches: Matches
+    matches: silhouettes.Matches
     noise: Float[Array, ""]
     scales: Float[Array, "2"]
     keypoints: Observations | None
@@ -201,7 +188,7 @@ def evidence_residuals(
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
         clothes = clothing_thickness(origin, state, points.weights) * focal.mean() / depth[:, 0]
         pixels, scales = seen[:, :2] / depth * focal + K[:2, 2], (evidence.scales[0], evidence.scales[1])
-        return silhouette_residuals(matches, pixels, clothes, evidence.noise, scales, independent)
+        return silhouettes.silhouette_residuals(matches, pixels, clothes, evidence.noise, scales, independent)
 
     parts = {"silhouettes": jax.vmap(silhouette)(evidence.points, evidence.matches, frame, K, cam_from_world)}
     if evidence.keypoints is not None:
@@ -222,9 +209,7 @@ def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
 
 
 @functools.partial(jax.jit, static_argnames="independent")
-def solve_round(
-    model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float
-) -> tuple[FitState, Outcome]:
+def solve_round(model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float) -> FitState:
     """The state after some steps with fixed matches."""
 
     def residuals(y):
@@ -232,7 +217,7 @@ def solve_round(
         return evidence_residuals(model, origin, y, evidence, independent), counted
 
     many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
-    return solve(residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm")
+    return solve(residuals, state, PATIENCE * STEPS if many else STEPS, method="lbfgs" if many else "lm")[0]
 
 
 # Iterations ----------------------------------------------------------------------------------------------------------
@@ -260,8 +245,8 @@ class Scene:
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
         self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
-        self.edges = mesh_edges(self.faces)
-        self.boundaries = [mask_boundary(mask, config.points) for mask in self.masks]
+        self.edges = silhouettes.mesh_edges(self.faces)
+        self.boundaries = [silhouettes.mask_boundary(mask, config.points) for mask in self.masks]
         kind = None if keypoints is None else keypoints.set
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
@@ -270,30 +255,27 @@ class Scene:
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
 
-    def run(self) -> tuple[FitState, Outcome, float]:
-        """The state after all iterations, what the solver did in each (a batch), and the largest move of the last round, in
-        expected standard deviations.
-        """
-        config, state, outcomes, move = self.config, start_state(self.origin, self.config), [], 0.0
+    def run(self) -> tuple[FitState, float]:
+        """The state after all iterations, and the largest move of the last round, in expected standard deviations."""
+        config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = REACH
         for turn in range(config.iterations):
             evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)))
             before = state
-            state, outcome = solve_round(self.model, self.origin, evidence, state, config.independent)
-            outcomes.append(outcome)
+            state = solve_round(self.model, self.origin, evidence, state, config.independent)
             moves = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before)
             move = max(jax.tree.leaves(moves))
-        return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcomes), move
+        return state, move
 
     def look(self, state: FitState, reach: float) -> Evidence:
         """What the views show, matched within `reach` pixels of the body in this state."""
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
-        boundaries = [body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
+        boundaries = [silhouettes.body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
         views = zip(boundaries, self.masks, self.boundaries, strict=True)
-        matches = [match(boundary, mask, other, reach, count) for boundary, mask, other in views]
+        matches = [silhouettes.match(boundary, mask, other, reach, count) for boundary, mask, other in views]
         return Evidence(
-            points=boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
+            points=silhouettes.boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
             matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
             noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
             scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
@@ -315,12 +297,12 @@ class Scene:
         known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
         return np.where(known, np.asarray(errors), np.nan)[:, 0]
 
-    def body_views(self, capture: Capture) -> list[BodyView]:
+    def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
         """The body of a capture of these photos in every view."""
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
         vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
         faces = capture.body.faces
-        return [view_body(vertices[int(frame)], faces, cameras[i]) for i, frame in enumerate(capture.frames)]
+        return [silhouettes.view_body(vertices[int(frame)], faces, cameras[i]) for i, frame in enumerate(capture.frames)]
 
     def score(self, capture: Capture) -> Score:
         """How well the body of a capture of these photos agrees with masks and keypoints."""
@@ -354,10 +336,10 @@ def _keypoint_errors(
     return jax.vmap(reprojection_errors)(seen, landmarks[frames])
 
 
-def _noise(boundaries: Sequence[Boundary], matches: Sequence[Matches]) -> float:
+def _noise(boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]) -> float:
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
     off = [
-        np.asarray(distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
+        np.asarray(silhouettes.distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
         for boundary, m in zip(boundaries, matches, strict=True)
         if len(boundary.positions)
     ]
@@ -414,7 +396,7 @@ def refine_capture(
             "capture", "masks", "none shows anybody, and there are no keypoints: refinement needs one or the other"
         )
     scene = Scene(capture, keypoints, config)
-    state, outcome, move = scene.run()
+    state, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)
     kept = _better(found, before, config.keypoints_worse)
@@ -423,7 +405,7 @@ def refine_capture(
     kinds = " and ".join(name for name, value in kinds.items() if value is not None)
     verdict = "kept" if kept else "no sufficient improvement, the start is kept"
     note = f"{kinds}: loss {before.loss:.4f} -> {found.loss:.4f}, {verdict} (last move {move:.2g} expected std)"
-    return RefinedCapture(best, _report(capture, best, before, score, Stage.of("silhouettes", outcome), note))
+    return RefinedCapture(best, _report(capture, best, before, score, note))
 
 
 def _better(found: Score, before: Score, most_worse: float) -> bool:
@@ -433,7 +415,7 @@ def _better(found: Score, before: Score, most_worse: float) -> bool:
     return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
 
 
-def _report(start: Capture, best: Capture, before: Score, after: Score, stage: Stage, note: str) -> FitReport:
+def _report(start: Capture, best: Capture, before: Score, after: Score, note: str) -> FitReport:
     kept = best is not start
     names = {"silhouette_iou": "iou", "keypoint_error_px": "keypoints", "loss": "loss"}
     pairs = {name: (getattr(before, key), getattr(after, key)) for name, key in names.items()}
@@ -454,7 +436,6 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, stage: S
         kept=kept,
         errors=errors,
         views=tuple(ViewReport(name, frame, iou_before=a, iou_after=b) for name, frame, a, b in ious),
-        stages=(stage,),
         moved=moved,
         violations=limit_violations(best.body.joint_names, best.poses),
         notes=tuple(notes),

@@ -1,4 +1,4 @@
-"""One report for every fit: what was fitted, errors by evidence, convergence, limits, uncertainty and warnings.
+"""One report for every fit: what was fitted, errors by evidence, limits, uncertainty and warnings.
 
 `str(report)` is what the command line prints, `report.to_json()` what is stored beside the result.
 """
@@ -17,7 +17,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import text_table
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
-from humangs_jax.fitting.state import Outcome, pose_prior
+from humangs_jax.fitting.state import pose_prior
 from humangs_jax.fitting.swaps import Swap
 
 ROWS = 24
@@ -61,24 +61,6 @@ class ViewReport:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stage:
-    """Runs of the solver in one stage: how many, how many converged, and means of steps and of the cost before and after."""
-
-    name: str
-    runs: int
-    converged: int
-    steps: float
-    before: float
-    after: float
-
-    @classmethod
-    def of(cls, name: str, outcome: Outcome) -> "Stage":
-        """From one outcome or a batch."""
-        done, *means = (np.atleast_1d(getattr(outcome, key)) for key in ("converged", "steps", "before", "after"))
-        return cls(name, done.size, int(done.sum()), *(float(values.mean()) for values in means))
-
-
-@dataclasses.dataclass(frozen=True)
 class Violation:
     """A joint that exceeds its limit about an axis of the T-pose."""
 
@@ -103,7 +85,6 @@ class FitReport:
     start: str = ""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
     views: tuple[ViewReport, ...] = ()
-    stages: tuple[Stage, ...] = ()
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
     violations: tuple[Violation, ...] = ()
     swaps: tuple[Swap, ...] = ()
@@ -121,9 +102,8 @@ class FitReport:
         return _plain(dataclasses.asdict(self))
 
     def __str__(self) -> str:
-        """Tables of stages and views, then errors, notes and warnings."""
-        lines = [*_stage_rows(self.stages), ""] if self.stages else []
-        lines += _view_rows(self.views) if self.views else []
+        """A table of views, then errors, notes and warnings."""
+        lines = _view_rows(self.views) if self.views else []
         for key, change in self.errors.items():
             label, form = LABELS[key]
             start = "" if change.before is None else f"{form.format(change.before)} -> "
@@ -140,14 +120,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(own) for own in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _stage_rows(stages: Sequence[Stage]) -> list[str]:
-    rows = [["stage", "converged", "steps", "cost before -> after"]]
-    for stage in stages:
-        cost = f"{stage.before:.4g} -> {stage.after:.4g}"
-        rows.append([stage.name, f"{stage.converged} of {stage.runs}", f"{stage.steps:.0f}", cost])
-    return text_table(rows)
 
 
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:

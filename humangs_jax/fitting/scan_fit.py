@@ -30,7 +30,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import mirrored_name
 from humangs_jax.fitting.landmark_fit import cube_rotations
-from humangs_jax.fitting.report import Change, FitReport, Stage, limit_violations
+from humangs_jax.fitting.report import Change, FitReport, limit_violations
 from humangs_jax.fitting.residuals.keypoints import trunk_weights
 from humangs_jax.fitting.residuals.scan import (
     BodySurface,
@@ -46,7 +46,7 @@ from humangs_jax.fitting.residuals.scan import (
     scan_residuals,
 )
 from humangs_jax.fitting.scan_files import SCAN_LANDMARKS, Scan, checked_joints, read_scan
-from humangs_jax.fitting.state import MIRROR, FitState, Outcome, half_squares, pose_prior, scale_of, solve, state_of
+from humangs_jax.fitting.state import MIRROR, FitState, half_squares, pose_prior, scale_of, solve, state_of
 from humangs_jax.fitting.triangulation import Similarity, align_robustly
 from humangs_jax.geometry.mesh import directions_around, face_areas
 
@@ -82,22 +82,23 @@ LOOSE = 0.01
 
 def run_iterations(
     problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState, iterations: tuple[Round, ...]
-) -> tuple[FitState, list[Outcome]]:
-    """The body after some iterations, and what the solver did in each."""
-    outcomes = []
+) -> tuple[FitState, float]:
+    """The body after some iterations, and the share of the cost by which the last one lowered it."""
+    gain = 0.0
     for each in iterations:
         matches = target.matches(problem, state, each.gate, each.robust_scale, tolerances)
         own = dataclasses.replace(tolerances, prior=jnp.float32(each.prior))
-        state, outcome = improve(problem, matches, given, own, state)
-        outcomes.append(outcome)
-    return state, outcomes
+        before = float(_cost(problem, matches, given, own, state))
+        state, after = improve(problem, matches, given, own, state)
+        gain = 1 - float(after) / before
+    return state, gain
 
 
 @functools.partial(jax.jit, static_argnames="steps")
 def improve(
     problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int = STEPS
-) -> tuple[FitState, Outcome]:
-    """The body after at most `steps` steps of the solver with these pairs, and what the solver did."""
+) -> tuple[FitState, Float[Array, ""]]:
+    """The body after at most `steps` steps of the solver with these pairs, and its cost."""
     return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
 
 
@@ -369,11 +370,11 @@ def fit_scan(
     target = Target(scan, start.align, FINE_POINTS, effective, FINE_NORMAL)
     if clothed:
         iterations = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations)
-    state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
+    state, gain = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
     away, covered = target.distances(whole, state, iterations[-1].gate)
-    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, outcomes[-1])
+    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, gain)
     violations = limit_violations(body.joint_names, jax.tree.map(lambda leaf: leaf[None], pose))
     report = dataclasses.replace(report, violations=violations)
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
@@ -399,7 +400,7 @@ def _report(
     up: str,
     distances: Float[np.ndarray, " r"],
     covered: float,
-    outcome: Outcome,
+    gain: float,
 ) -> FitReport:
     errors = {"scan_near_body": Change(covered)}
     if len(distances):
@@ -411,16 +412,13 @@ def _report(
     notes.append(f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface")
     if scan.turned:
         notes.append("the faces of the file were inside out and have been reversed")
-    last = Stage.of("last round", outcome)
-    settled = last.before - last.after < SETTLED * last.before
-    if not settled:
+    if gain > SETTLED:
         notes.append("the body was still moving in the last round")
     doubt = "much of the scan is not near the body: does it contain a floor, or other things?"
     return FitReport(
         fitted="scan",
         start="landmarks" if from_joints else "search",
         errors=errors,
-        stages=(dataclasses.replace(last, converged=int(settled)),),
         notes=tuple(notes),
         warnings=(doubt,) if covered < LITTLE else (),
     )

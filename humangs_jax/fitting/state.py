@@ -34,7 +34,7 @@ from jax.flatten_util import ravel_pytree
 
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import EXACT, BodyPose
-from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera
@@ -42,19 +42,6 @@ from humangs_jax.geometry.camera import Camera
 T = TypeVar("T")
 NORMAL_MAD = 1.4826
 """Standard deviations of a normal distribution per median absolute deviation."""
-
-
-@pytree_dataclass
-class Outcome:
-    """What a solver did; () each, or a batch.
-
-    before, after: half the square sum. steps: taken. converged: False if it ran out of steps or found nothing better.
-    """
-
-    before: Float[Array, ""]
-    after: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
 
 
 def half_squares(tree: PyTree) -> Float[Array, ""]:
@@ -78,11 +65,12 @@ def solve(
     method: Literal["lbfgs", "lm"],
     tolerance: float = 1e-4,
     free: T | None = None,
-) -> tuple[T, Outcome]:
+) -> tuple[T, Float[Array, ""]]:
     """Minimise from a start.
 
     Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of the loss. free: pytree of
-    booleans like start; the others stay. Returns the solution, or the start where that is no worse, and so finite numbers.
+    booleans like start; the others stay.
+    Returns: the solution, or the start where that is no worse, and so finite numbers; and half its square sum.
     """
     import lineax
     import optimistix
@@ -101,9 +89,7 @@ def solve(
             found = optimistix.least_squares(vector, lm, flat, max_steps=steps, throw=False)
         before, after = half_squares(of(flat)), half_squares(of(found.value))
         better = after <= before  # False for NaN
-        converged = better & (found.result == optimistix.RESULTS.successful)
-        value = hold(jnp.where(better, found.value, flat))
-        return unravel(value), Outcome(before, jnp.where(better, after, before), jnp.asarray(found.stats["num_steps"]), converged)
+        return unravel(hold(jnp.where(better, found.value, flat))), jnp.where(better, after, before)
 
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])

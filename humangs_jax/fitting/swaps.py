@@ -6,7 +6,7 @@ trial, the clearest first, and reported if the views then agree clearly better:
     sides     left and right of the keypoints of one view; needs two views, of which either may be the wrong one
     cameras   of two views, which is the same as their photos; needs three views
 
-Left and right exchanged in all views agree as well. Only a fit of the body finds that (`find_mirrored`).
+Left and right exchanged in all views agree as well: that is not found.
 
 A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of views propose
 (`triangulation.triangulate_robustly`), so that outliers count little.
@@ -21,11 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import KeypointSet
-from humangs_jax.fitting.landmark_fit import LandmarkFit, fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations
 from humangs_jax.fitting.state import camera_numbers
 from humangs_jax.fitting.triangulation import agreement, triangulate_robustly
@@ -40,8 +38,6 @@ ALIKE = 0.9
 """Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras several are equivalent."""
 SAME_CAMERA = 1e-3
 """Share of the focal length, and metres, by which a camera that stands still may differ between frames."""
-MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
-"""The mirrored person is right if its cost is less than this share of the given one's, or lower by this much."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,14 +48,12 @@ class Swap:
     in how many; the views are those of the first.
     """
 
-    kind: Literal["sides", "cameras", "all sides"]
-    views: tuple[str, ...] = ()
+    kind: Literal["sides", "cameras"]
+    views: tuple[str, ...]
     instead: tuple[str, ...] = ()
     frames: int = 1
 
     def __str__(self) -> str:
-        if self.kind == "all sides":
-            return "left and right of the keypoints seem exchanged in all views: the mirrored person fits much better"
         if self.kind == "cameras":
             frames = f", as in {self.frames} frames" if self.frames > 1 else ""
             other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
@@ -90,15 +84,6 @@ def find_swaps(
             return (*exchanges, *_sides(observations, views, order, names))
 
 
-def find_mirrored(model: LandmarkModel, observations: Observations, kind: KeypointSet, fit: LandmarkFit) -> tuple[Swap, ...]:
-    """Left and right exchanged in all views: the keypoints are mirrored and fitted once more. fit: of these observations."""
-    everywhere = given(*observations.points.shape[:2], mirrored=True)
-    mirrored = arranged(observations, np.asarray(kind.mirror), everywhere)
-    # the last stage in units of the expected noise: stage "person" has the noise that each fit found for itself
-    cost, other = (float(x.outcomes["hands"].after.sum()) for x in (fit, fit_landmarks(model, mirrored)))
-    return (Swap("all sides"),) if other < MIRRORED_SHARE * cost or other < cost - MIRRORED_GAIN else ()
-
-
 # How well views agree --------------------------------------------------------------------------------------------------
 
 
@@ -121,9 +106,9 @@ class Order(NamedTuple):
         return Order(source, mirrored)
 
 
-def given(frames: int, views: int, mirrored: bool = False) -> Order:
+def given(frames: int, views: int) -> Order:
     """Every camera has its own keypoints."""
-    return Order(np.tile(np.arange(views), (frames, 1)), np.full((frames, views), mirrored))
+    return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
 def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: Order) -> Observations:

@@ -50,8 +50,6 @@ def test_views_are_sorted_by_their_frames(folder, fitted):
     assert errors.mean() < 10
     report = fitted.report
     assert fitted.capture.frame_count == len(FRAMES) and report.ok and len(report.views) == 4 * len(FRAMES)
-    assert [stage.name for stage in report.stages] == ["rigid", "points", "body", "hands", "person"]
-    assert all(stage.after <= stage.before and stage.steps > 0 for stage in report.stages)
     assert report.errors["keypoint_error_px"].after == pytest.approx(1.1774 * 2.0, rel=0.1)
     assert json.loads(json.dumps(report.to_json()))["views"][0]["name"] == fitted.capture.names[0]
 

@@ -104,7 +104,7 @@ def test_a_bare_body_is_found_whatever_its_scale_turn_and_place_and_stands_in_ou
     assert off(bare, truth).mean() < 8
     assert np.quantile(np.abs(bare.distances), 0.9) < 0.003
     report = bare.report
-    assert report.errors["scan_near_body"].after > 0.97 and report.ok and report.stages[-1].converged
+    assert report.errors["scan_near_body"].after > 0.97 and report.ok and "still moving" not in str(report)
     assert abs(report.errors["scan_outside_median_mm"].after) < 1.5
     assert "given joints" in str(report)
     scan = bare.world_from_scan(truth[3](truth[0]))

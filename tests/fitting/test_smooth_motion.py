@@ -70,7 +70,7 @@ def smoothed(seen, start, spoilt=()):
     nothing = jnp.zeros((FRAMES, 1, 3))
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations))
     state = states_of(rotations, translations)
-    fit = LandmarkFit(state.betas, poses, jnp.zeros((FRAMES, 8, 3)), nothing, seen.noise, state, {}, jnp.zeros(()), jnp.ones(8))
+    fit = LandmarkFit(state.betas, poses, jnp.zeros((FRAMES, 8, 3)), nothing, seen.noise, state, jnp.zeros(()), jnp.ones(8))
     return smooth_motion(MODEL, seen, fit, STD)
 
 

@@ -1,7 +1,6 @@
 """Joints by rays of several cameras; left and right exchanged in views."""
 
 import dataclasses
-import types
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +12,9 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.data.photos import Photos
-from humangs_jax.fitting import swaps as module
 from humangs_jax.fitting import triangulation
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
-from humangs_jax.fitting.swaps import find_mirrored, find_swaps
+from humangs_jax.fitting.swaps import find_swaps
 from humangs_jax.fitting.triangulation import (
     Match,
     Seen,
@@ -292,24 +290,6 @@ def test_one_view_and_views_that_are_missing():
     assert [swap.views for swap in swaps] == [("m2v2",)]
     blind = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
     assert found(capture, blind) == ()
-
-
-def test_mirrored_people(monkeypatch):
-    """By what a fit to the mirrored keypoints costs; that it finds the people themselves is measured, not tested here."""
-    fit = lambda cost: types.SimpleNamespace(outcomes={"hands": types.SimpleNamespace(after=jnp.full(4, cost / 4))})
-    capture, keypoints = person(19, 4, 2)
-    observations, kind, _ = seen(capture, keypoints)
-    for given, other, better in ((10.0, 5.0, True), (10.0, 7.0, False), (1000.0, 900.0, True), (1000.0, 950.0, False)):
-        asked = []
-        monkeypatch.setattr(module, "fit_landmarks", lambda _, seen, asked=asked, other=other: asked.append(seen) or fit(other))
-        swaps = _unchecked(find_mirrored)(None, observations, kind, fit(given))
-        np.testing.assert_array_equal(asked[0].points, np.asarray(observations.points)[:, :, MIRROR])
-        assert [swap.kind for swap in swaps] == ["all sides"] * better and all("in all views" in str(swap) for swap in swaps)
-
-
-def _unchecked(function):
-    """Without the check of types, which the stand-in of a fit would fail."""
-    return getattr(function, "__wrapped__", function)
 
 
 # People of several views are told apart by how their landmarks triangulate --------------------------------------------
