@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io import arrays
 from humangs_jax.io.atomic import check_replaceable
-from humangs_jax.io.reading import FileError, parse_json, read_text, reading, shown
+from humangs_jax.io.reading import FileError, inside, parse_json, read_text, reading, shown
 
 COLOR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
@@ -45,6 +45,12 @@ def checked_json(file: Path, text: str | None = None, missing: str = "no such fi
     """The value in a JSON file, or in its text where that is known."""
     with reading(file, "JSON file", CaptureError):
         return parse_json(checked_text(file, missing) if text is None else text)
+
+
+def checked_path(folder: Path, name: object, where: object) -> Path:
+    """The path of a photo that a file in a folder names, see `io.reading.inside`. where: what errors name."""
+    with reading(where, "path", CaptureError):
+        return inside(folder, str(name), photo=True)
 
 
 def check_place(folder: Path, overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:

@@ -63,7 +63,7 @@ def test_a_format_of_cameras_is_one_row(tmp_path, made_up, capsys):
     assert look(tmp_path).cameras == tmp_path
     for i, source in enumerate((tmp_path, tmp_path / "studio.rig")):
         report = import_cameras(source, tmp_path, tmp_path.with_name(f"out{i}"))
-        assert (report.format, report.up, report.warnings) == ("Rig of ours", "+y", ())
+        assert report.read_as.startswith("read as: Rig of ours (") and "; +y up;" in report.read_as and not report.warnings
     for command in (("import", "cameras"), ("start",)):
         assert "Rig of ours (*.rig)" in " ".join(help_of(capsys, *command).replace("│", "").split())
     assert "| Rig of ours | `*.rig` |  | +0.5 | +y | camera |\n" in format_table("cameras")

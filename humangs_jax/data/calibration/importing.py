@@ -58,41 +58,29 @@ class ImportReport:
     """What was imported and how it was read; `str(report)` is what the command line prints."""
 
     out: Path
-    format: str
-    source: Path
     cameras: int
     frames: int
     views: int
     width: int
     height: int
-    scale: float
-    up: str
-    pixel_centers: str
-    convention: str
     undistorted: int
-    checks: Checks
-    notes: tuple[str, ...] = ()
-    """Further lines."""
-    masks: bool = False
-    """Whether it has mask files."""
-    turned: int = 0
+    turned: int
     """Photos that were turned upright by their EXIF orientation."""
-    heic: int = 0
+    heic: int
     """Photos that were HEIC, or their masks."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Likely mistakes."""
-        return self.checks.warnings
+    masks: bool
+    """Whether it has mask files."""
+    checks: Checks
+    read_as: str
+    notes: tuple[str, ...]
+    """Further lines."""
+    warnings: tuple[str, ...]
+    """Likely mistakes."""
 
     def __str__(self) -> str:
         photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
-        centers = "whole numbers (0.5 added to cx and cy)" if self.pixel_centers == "integer" else "+0.5"
-        lines = [
-            f"{self.out}: {photos} of {self.width} x {self.height} pixels: {cameras}, {counted(self.frames, 'frame')}",
-            f"read as: {self.format} ({self.source}): {self.convention}; {self.up} up; "
-            f"{self.scale:g} m per unit; pixel centres at {centers}",
-        ]
+        size = f"{self.width} x {self.height}"
+        lines = [f"{self.out}: {photos} of {size} pixels: {cameras}, {counted(self.frames, 'frame')}", self.read_as]
         if self.undistorted:
             lines.append(f"lens distortion removed from {counted(self.undistorted, 'photo')}")
         if self.checks.reprojection is not None:
@@ -189,25 +177,23 @@ def import_calibration(
     replace_folder(out, write, mark="capture.json")
     if cut:
         warnings.append(f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background")
+    centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
+    said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
     return ImportReport(
         out=out,
-        format=calibration.format,
-        source=calibration.file,
         cameras=cameras,
         frames=frames,
         views=len(photos),
         width=canvas[0],
         height=canvas[1],
-        scale=scale,
-        up=up,
-        pixel_centers=pixel_centers,
-        convention=calibration.convention,
         undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
-        checks=dataclasses.replace(checks, warnings=(*checks.warnings, *warnings)),
-        notes=tuple(notes),
-        masks=photos[0].mask is not None,
         turned=sum(turn.rewrites for turn in turns),
         heic=heic,
+        masks=photos[0].mask is not None,
+        checks=checks,
+        read_as=f"read as: {said}; {up} up; {scale:g} m per unit; pixel centres at {centers}",
+        notes=tuple(notes),
+        warnings=(*checks.warnings, *warnings),
     )
 
 

@@ -7,17 +7,16 @@ turned photo (OpenCV) is told by its size. No camera sees a mirrored photo.
 
 import dataclasses
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
-from humangs_jax.data.capture_checks import CaptureError, counted, few
+from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
 from humangs_jax.data.photos import read_checked, read_mask
 from humangs_jax.io.images import image_size, open_image, orientation, read_image
-from humangs_jax.io.reading import inside, reading
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
 """File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
@@ -68,7 +67,7 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     for i, name in ((i, camera.mask) for i, camera in enumerate(calibration.cameras) if camera.mask):
         for folder in (calibration.file.parent, images, images.parent):
             if (path := _any_suffix(folder / name.replace("\\", "/"))) is not None:
-                _check_inside(folder, path.absolute())
+                checked_path(folder, path.absolute(), folder)
                 found[i] = path
                 break
     missing = next((camera for i, camera in enumerate(calibration.cameras) if i not in found), None)
@@ -87,14 +86,9 @@ def photo_of(folder: Path, name: str, file: Path) -> Path:
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")]
     for start in range(len(parts)):
         if (photo := _any_suffix(folder.joinpath(*parts[start:]))) is not None:
-            _check_inside(folder, photo.relative_to(folder))
+            checked_path(folder, photo.relative_to(folder), folder)
             return photo
     raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
-
-
-def _check_inside(folder: Path, name: str | Path) -> None:
-    with reading(folder, "path", CaptureError):
-        inside(folder, str(name), photo=True)
 
 
 def _any_suffix(path: Path) -> Path | None:
@@ -130,7 +124,7 @@ def _mask_file(masks: Path, images: Path, image: Path) -> Path:
 def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
-        _check_inside(images, name)
+        checked_path(images, name, images)
     of_frame = {folder.name: _photos_in(folder) for folder in images.iterdir() if folder.is_dir()}
     alone = _photos_in(images)
     layouts: tuple[list[dict[str, Path]], ...] = (
@@ -138,26 +132,19 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
         [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names],
         [{"": alone[name]} if name in alone else {} for name in names],
     )
-    frames_of = next((layout for layout in layouts if any(layout)), None)
-    if frames_of is None:
-        shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-        raise CaptureError(images, "", f"no photo of the cameras {shown}: expected {LAYOUTS}")
+    frames_of = next((layout for layout in layouts if any(layout)), layouts[-1])
     for name, photos in zip(names, frames_of, strict=True):
         if not photos:
             raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
-    frames = {frame: i for i, frame in enumerate(_in_order({f for photos in frames_of for f in photos}))}
+    numbers = {frame for photos in frames_of for frame in photos}
+    order = sorted(numbers, key=lambda f: (int(f), f)) if all(f.isdecimal() for f in numbers) else sorted(numbers)
+    frames = {frame: i for i, frame in enumerate(order)}  # 10 after 9
     return [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
 
 
 def _photos_in(folder: Path) -> dict[str, Path]:
     entries = os.scandir(folder) if folder.is_dir() else ()
     return {Path(e.name).stem: Path(e.path) for e in entries if is_photo(Path(e.name)) and e.is_file()}
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """Names sorted by number where all are numbers (10 after 9), else by letter."""
-    names = list(names)
-    return sorted(names, key=lambda name: (int(name), name)) if all(n.isdecimal() for n in names) else sorted(names)
 
 
 # Orientation ----------------------------------------------------------------------------------------------------------

@@ -43,9 +43,12 @@ from humangs_jax.data.calibration.calibration import (
     CalibratedCamera,
     Calibration,
     brown_conrady,
+    image_size,
     in_capture_convention,
+    intrinsics,
     pose_matrix,
     read_calibration,
+    rotation,
     undistort_person,
 )
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_text
@@ -61,7 +64,6 @@ from humangs_jax.data.datasets.subject import (
     open_arrays,
 )
 from humangs_jax.data.photos import read_checked
-from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.images import image_in, read_grey, read_image
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, read_text, reading
 
@@ -87,18 +89,9 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     eyes = np.zeros((count, 6))
     parts = [angles[key] for key in ("global_orient", "body_pose", "jaw_pose")]
     rotations = np.concatenate([*parts, eyes, angles["left_hand_pose"], angles["right_hand_pose"]], axis=1)
-    shape = [_first_row(values, key, count) for key in ("betas", "expression")]
+    shape = [values.numbers(key, (None, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
     betas = coefficients(body.model, shape[0], shape[1], file)
     return BodyParameters(betas, rotations.reshape(count, -1, 3), translations)
-
-
-def _first_row(values: ArrayFile, key: str, count: int) -> Float[np.ndarray, " s"]:
-    array = values.numbers(key, (None,) * values.array(key).ndim, LARGEST_COEFFICIENT)
-    if array.ndim == 1:
-        return array
-    if array.ndim != 2 or len(array) not in (1, count):
-        raise CaptureError(values.path, key, f"expected shape (1, any) or ({count}, any), got {array.shape}")
-    return array[0]
 
 
 def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
@@ -125,17 +118,10 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
     return calibration.cameras
 
 
-def plain_number(stem: str) -> int | None:
-    """The frame of "00000120"; None for other names."""
-    return int(stem) if stem.isdecimal() else None
-
-
-def numbered(folder: Path, frame_of: Callable[[str], int | None]) -> dict[int, Path]:
-    """Frame -> its file, of the photos in a folder; empty if it does not exist."""
-    names = os.listdir(folder) if folder.is_dir() else ()
-    stems = [os.path.splitext(name) for name in names]
-    frames = [frame_of(stem) if suffix.lower() in PHOTO_SUFFIXES else None for stem, suffix in stems]
-    return {frame: folder / name for frame, name in zip(frames, names, strict=True) if frame is not None}
+def numbered(folder: Path) -> dict[int, Path]:
+    """Frame -> its file, of the photos in a folder, by the number at the end of the name; empty if it does not exist."""
+    names = [name for name in (os.listdir(folder) if folder.is_dir() else ()) if name.lower().endswith(PHOTO_SUFFIXES)]
+    return {int(found[1]): folder / name for name in names if (found := re.search(r"(\d+)\.\w+$", name))}
 
 
 def read_missing(file: Path) -> set[tuple[str, int]]:
@@ -187,9 +173,8 @@ def video_subject(
     def read_view(view: int) -> Photo:
         frame, owner = int(frames[view]), int(owners[view])
         image, person = read(photos[owner][frame], masks[owner][frame])
-        camera = cameras[owner]
-        lens = camera.distortion
-        return (image, person) if lens is None else undistort_person(image, person, camera.K, lens)
+        K, lens = cameras[owner].K, cameras[owner].distortion
+        return (image, person) if lens is None else undistort_person(image, person, K, lens)
 
     return Subject(
         name=str(name),
@@ -197,7 +182,6 @@ def video_subject(
         cam_from_world=np.stack([camera.cam_from_world for camera in cameras])[owners],
         sizes=np.asarray([(camera.width, camera.height) for camera in cameras])[owners],
         frames=frames,
-        cameras=owners,
         frame_count=count,
         view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view]:0{digits}d}",
         read=read_view,
@@ -212,10 +196,9 @@ def folder_subject(
     folders: Sequence[tuple[Path, Path]],
     parameters: BodyParameters,
     listed: Set[tuple[str, int]] = frozenset(),
-    frame_of: Callable[[str], int | None] = plain_number,
 ) -> Subject:
-    """`video_subject` of files in folders of each camera's photos and masks. frame_of: of a file's name without suffix."""
-    photos, masks = ([numbered(folder, frame_of) for folder in part] for part in zip(*folders, strict=True))
+    """`video_subject` of files in folders of each camera's photos and masks."""
+    photos, masks = ([numbered(folder) for folder in part] for part in zip(*folders, strict=True))
     return video_subject(name, cameras, photos, masks, on_white, parameters, listed)
 
 
@@ -281,23 +264,16 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
 
 
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
-    """One sequence, in the smallest images that are there.
-
-    Raises: CaptureError naming file and key.
-    """
+    """One sequence, in the smallest images that are there. Raises: CaptureError naming file and key."""
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
     cameras = read_csv_cameras(folder / scale / CALIBRATION)
     places = [(folder / scale / "rgbs" / camera.name, folder / scale / "masks" / camera.name) for camera in cameras]
-    named = re.compile(r"[\w-]+_(?:rgb|mask)(\d+)")
-    frame_of = lambda stem: int(found[1]) if (found := named.fullmatch(stem)) else None
-    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body), frame_of=frame_of)
+    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body))
 
 
 def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     """The cameras of a csv. Raises: CaptureError naming file, camera and column."""
-    from scipy.spatial.transform import Rotation
-
     with reading(file, "csv file", CaptureError):
         rows = list(csv.DictReader(io.StringIO(checked_text(file))))
     cameras = []
@@ -305,23 +281,19 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
         name = row.get("name")
         if not name or not re.fullmatch(r"[\w-]+", name) or any(camera.name == name for camera in cameras):
             raise CaptureError(file, f"line {number}: name", f"expected the name of a camera of its own, got {name!r}")
-        values = {}
+        numbers = []
         for key in COLUMNS:
             try:
-                values[key] = float(row[key])
+                numbers.append(float(row[key]))
             except (KeyError, TypeError, ValueError):
                 raise CaptureError(file, f"{name}.{key}", f"expected a number, got {row.get(key)!r}") from None
-        checked_numbers(list(values.values()), file, name, (len(COLUMNS),), largest=float(limits().side))
-        width, height = values["w"], values["h"]
-        if width % 1 or height % 1 or min(width, height) <= 0:
-            raise CaptureError(file, f"{name}.w", f"expected whole pixels, got {width:g} x {height:g}")
-        if max(values["fx"], values["fy"]) > 100:
-            raise CaptureError(file, f"{name}.fx", f"expected a share of the width, got {values['fx']:g}: in pixels?")
-        K = np.diag([values["fx"] * width, values["fy"] * height, 1.0])
-        K[:2, 2] = values["px"] * width, values["py"] * height
-        turn = Rotation.from_rotvec([values[key] for key in ("rx", "ry", "rz")]).as_matrix().T
-        center = np.asarray([values[key] for key in ("tx", "ty", "tz")])
-        cameras.append(CalibratedCamera(name, K, pose_matrix(turn, -turn @ center), int(width), int(height)))
+        values = checked_numbers(numbers, file, name, (len(COLUMNS),), largest=float(limits().side))
+        width, height = image_size(values[:2], file, f"{name}.w")
+        turn, center, (fx, fy, px, py) = rotation(values[2:5], file, name).T, values[5:8], values[8:].tolist()
+        if max(fx, fy) > 100:
+            raise CaptureError(file, f"{name}.fx", f"expected a share of the width, got {fx:g}: in pixels?")
+        K = intrinsics(fx * width, fy * height, px * width, py * height)
+        cameras.append(CalibratedCamera(name, K, pose_matrix(turn, -turn @ center), width, height))
     if not cameras:
         raise CaptureError(file, "", f"no camera: expected the columns name,{','.join(COLUMNS)}")
     return checked_cameras(Calibration("ActorsHQ", file, tuple(cameras), False, "half", "+y"))

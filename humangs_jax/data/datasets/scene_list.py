@@ -19,7 +19,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.calibration.calibration import intrinsics
-from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, expect, members
+from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, checked_path, expect, members
 from humangs_jax.data.datasets.subject import (
     STORED_SIZE,
     BodyParameters,
@@ -34,7 +34,7 @@ from humangs_jax.data.datasets.subject import (
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import image_size, read_grey, read_image
-from humangs_jax.io.reading import inside, reading, shown
+from humangs_jax.io.reading import shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
@@ -131,7 +131,6 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
         cam_from_world=poses,
         sizes=sizes,
         frames=frames.astype(np.int32),
-        cameras=np.arange(len(views)),
         frame_count=len(arrays),
         view_name=lambda view: f"{view:05d}",
         read=lambda view: _read_view(file, name, views[view]),
@@ -169,9 +168,8 @@ def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[Scen
     return views, {reason: count for reason, count in missing.items() if count}
 
 
-def _inside(file: Path, name: str, path: Any) -> Path:
-    with reading(f"{file}: {name}", "path", CaptureError):
-        return inside(file.parent, path, photo=True)
+def _inside(file: Path, name: str, path: str) -> Path:
+    return checked_path(file.parent, path, f"{file}: {name}")
 
 
 def _read_view(file: Path, name: str, view: SceneFrame) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "mask_h mask_w"]]:

@@ -221,7 +221,7 @@ class Subject:
 
     name: what errors and manifests call it. K: (v, 3, 3) pixels of the photo as it is, centres at +0.5. cam_from_world:
     (v, 4, 4), metres, OpenCV. sizes: (v, 2) width and height. frames: (v,) the pose that a view shows, counted from 0.
-    cameras: (v,) which camera took it. frame_count: number of poses. view_name: view -> a name such as "cam03_00000120".
+    frame_count: number of poses. view_name: view -> a name such as "cam03_00000120".
     read: view -> image on white (h, w, 3) and mask (h, w), both in [0, 1]. parameters: frames -> shape and these poses.
     missing: reason -> how many photos are left out for it.
     """
@@ -231,7 +231,6 @@ class Subject:
     cam_from_world: Float[np.ndarray, "v 4 4"]
     sizes: Int[np.ndarray, "v 2"]
     frames: Int[np.ndarray, " v"]
-    cameras: Int[np.ndarray, " v"]
     frame_count: int
     view_name: Callable[[int], str]
     read: Callable[[int], tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]

@@ -112,7 +112,6 @@ AVATARREX = {
     "no frames": (npz(POSES, global_orient=lambda x: x[:0]), POSES, "global_orient", "(0, 3)"),
     "text": (npz(POSES, transl=lambda x: x.astype(str)), POSES, "transl", "real numbers"),
     "300 shape coefficients": (npz(POSES, betas=lambda x: np.ones((3, 300))), POSES, "betas", "'shape_10' is no shape direction"),
-    "shape of other frames": (npz(POSES, betas=lambda x: x[:2]), POSES, "betas", "(2, 10)"),
     "calibration missing": (removed(RIG),),
     "no K": (rig("K", None), RIG, CAMERA, "K", "missing"),
     "no image size": (rig("imgSize", None), RIG, CAMERA, "imgSize"),
