@@ -300,7 +300,7 @@ def test_sources_that_are_none_are_named(rig, tmp_path):
         (empty, "empty: no cameras found: expected COLMAP"),
         (binary, r"cameras\.bin: no such file"),
         (half, r"extri\.yml: no such file"),
-        (tmp_path / "nothing.json", r"nothing\.json: empty"),
+        (tmp_path / "nothing.json", r"nothing\.json: not a known format"),
         (tmp_path / "list.json", "not a known format"),
         (tmp_path / "words.txt", "not a known format"),
         (tmp_path / "open.json", "line 1: not valid JSON"),

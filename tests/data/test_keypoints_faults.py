@@ -205,9 +205,9 @@ def test_files_and_folders_that_are_not_there(tmp_path):
 
 
 def test_a_folder_of_two_tools_is_refused(tmp_path):
-    (tmp_path / "front_keypoints.json").write_text(json.dumps({"people": []}))
+    (tmp_path / "front_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": [50.0] * 75}]}))
     (tmp_path / "back.json").write_text(json.dumps([entry("back")]))
-    with pytest.raises(CaptureError, match=r"front_keypoints\.json: of OpenPose, but back\.json is of COCO"):
+    with pytest.raises(CaptureError, match=r"front_keypoints\.json: 67 points of OpenPose, but back\.json has 17 points of COCO"):
         read_keypoints(tmp_path, NAMES, *SIZE)
 
 

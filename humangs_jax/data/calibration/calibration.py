@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, floats, numbers
+from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, file_numbers, floats
 from humangs_jax.data.formats import CAMERAS, CameraFormat
 from humangs_jax.io.reading import limits, reading
 
@@ -138,19 +138,14 @@ def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
     with reading(path, "calibration", CaptureError):
-        format = None if path.is_dir() else CAMERAS.of_name(path)
-        if path.is_dir():
-            if (found := CAMERAS.found(path)) is None:
-                raise CaptureError(path, "", f"no cameras found: expected {CAMERAS.listed()}")
-            format, path = found
+        format, file = CAMERAS.found(path) or (None, None) if path.is_dir() else (CAMERAS.of_name(path), path)
+        if file is None:
+            raise CaptureError(path, "", f"no cameras found: expected {CAMERAS.listed()}")
         if format is not None and format.folder:
-            source = Source(path.parent, photo_size)
-        else:
-            source = Source(path, photo_size)
-            format = CAMERAS.of_content(source)
-        if format is None:
-            problem = "not a known format" if source.text.strip() else "empty"
-            raise CaptureError(path, "", f"{problem}: expected {CAMERAS.listed()}")
+            return format(Source(file.parent, photo_size), format)
+        source = Source(file, photo_size)
+        if (format := CAMERAS.of_content(source)) is None:
+            raise CaptureError(file, "", f"not a known format: expected {CAMERAS.listed()}")
         return format(source, format)
 
 
@@ -211,9 +206,8 @@ def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
     """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector (cv2.Rodrigues)."""
     from scipy.spatial.transform import Rotation
 
-    if numbers(value, file, field).size == 3:
-        return Rotation.from_rotvec(floats(value, file, field, (3,))).as_matrix()
-    return floats(value, file, field, (3, 3))
+    values = file_numbers(value, file, field)
+    return Rotation.from_rotvec(values.ravel()).as_matrix() if values.size == 3 else floats(values, file, field, (3, 3))
 
 
 # Lenses ---------------------------------------------------------------------------------------------------------------
@@ -233,7 +227,7 @@ def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5
 
     Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or others than the first five are not 0.
     """
-    values = floats(values, file, field, (numbers(values, file, field).size,))
+    values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
         raise CaptureError(file, field, f"expected k1 k2 p1 p2 [k3], got {len(values)} numbers")
     if values[5:].any():
@@ -247,9 +241,8 @@ def distort(points: Float[np.ndarray, "*n 2"], coefficients: Float[np.ndarray, "
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], axis=-1
-    )
+    moved = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
+    return np.stack(moved, axis=-1)
 
 
 def undistort(

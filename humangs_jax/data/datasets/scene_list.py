@@ -168,7 +168,7 @@ def _present(file: Path, name: str, scene: Mapping[str, Any]) -> tuple[list[Scen
     return views, {reason: count for reason, count in missing.items() if count}
 
 
-def _inside(file: Path, name: str, path: str) -> Path:
+def _inside(file: Path, name: str, path: Any) -> Path:
     return checked_path(file.parent, path, f"{file}: {name}")
 
 

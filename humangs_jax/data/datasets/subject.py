@@ -175,13 +175,12 @@ def _shape_solvers(
     """(pseudo-inverse, columns, which vertices) of the least-squares problem of `recover_shape`: of all vertices, then
     without the hands.
     """
-    template, directions, _ = body.arrays
+    columns = np.concatenate([body.arrays[0][..., None], body.arrays[1]], axis=-1)
     of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6
     solvers = []
-    for kept in (np.ones(len(template), bool), ~of_hands):
-        columns = np.concatenate([template[..., None], directions], axis=-1)[kept]
-        columns = columns.reshape(-1, columns.shape[-1])
-        solvers.append((np.linalg.pinv(columns), columns, kept))
+    for kept in (np.ones(len(columns), bool), ~of_hands):
+        used = columns[kept].reshape(-1, columns.shape[-1])
+        solvers.append((np.linalg.pinv(used), used, kept))
     return tuple(solvers)
 
 

@@ -28,9 +28,9 @@ from humangs_jax.data.datasets.subject import (
     BodyParameters,
     FileBody,
     PosedPerson,
+    checked_numbers,
     coefficients,
     open_arrays,
-    posed_people,
 )
 from humangs_jax.io.arrays import check_array, check_indices
 from humangs_jax.io.mesh import read_meshes
@@ -48,15 +48,13 @@ another gender moves vertices by centimetres, a wrong hand convention the finger
 class Fit:
     """The body of a scan.
 
-    kind: see the module. betas: (s,) of all of the body's directions. rotations: (55, 3). translation: (3,) metres of the model.
-    scale: scan units per metre. A vertex V of the posed body (translation included) lies at V scale in the scan.
+    kind: see the module. parameters: of one pose. scale: scan units per metre. A vertex V of the posed body (translation
+    included) lies at V scale in the scan.
     """
 
     file: Path
     kind: Kind
-    betas: Float[np.ndarray, " s"]
-    rotations: Float[np.ndarray, "55 3"]
-    translation: Float[np.ndarray, "3"]
+    parameters: BodyParameters
     scale: float
 
 
@@ -123,28 +121,20 @@ def read_fit(file: str | Path, body: FileBody) -> Fit:
     scale = values.number("scale")
     if not scale > 0:
         raise CaptureError(file, "scale", f"expected a positive number, got {scale:g}")
-    offset = values.numbers(of_kind, (1, 3))[0]
-    translation = offset if kind == "C" else offset / scale
-    if np.abs(translation).max() > FARTHEST:
-        problem = f"expected at most {FARTHEST:g} m from the origin, got {np.abs(translation).max():.4g}: another unit?"
-        raise CaptureError(file, of_kind, problem)
+    offset = values.numbers(of_kind, (1, 3))
+    translation = checked_numbers(offset if kind == "C" else offset / scale, file, of_kind, largest=FARTHEST)
     parts = [values.numbers(key, (1, size), LARGEST_ANGLE)[0] for key, size in _ANGLES.items()]
     if kind == "A":
         components = np.asarray(body.hands.components, np.float64)
         hands = [hand @ components[side, :length] for side, hand in enumerate(hands)]
     means = np.asarray(body.hands.means, np.float64)
-    rotations = np.concatenate([*parts, *(hand + means[side] for side, hand in enumerate(hands))]).reshape(-1, 3)
+    rotations = np.concatenate([*parts, *(hand + means[side] for side, hand in enumerate(hands))]).reshape(1, -1, 3)
     shape = [values.numbers(key, (1, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
-    return Fit(file, kind, coefficients(body.model, shape[0], shape[1], file), rotations, translation, scale)
+    betas = coefficients(body.model, shape[0], shape[1], file)
+    return Fit(file, kind, BodyParameters(betas, rotations, translation), scale)
 
 
 _ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
-
-
-def fitted_body(fit: Fit, body: FileBody) -> PosedPerson:
-    """The body of a scan in scan units."""
-    parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
-    return next(posed_people(body.model, parameters, fit.scale))
 
 
 def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> tuple[float, float]:

@@ -45,8 +45,7 @@ def read_detections(path: Path) -> Detections:
     if not files:
         raise CaptureError(path, "", f"no JSON file in this folder: expected those of {KEYPOINTS.listed()}")
     images: list[DetectedImage] = []
-    tool: tuple[str, Path] | None = None
-    known: Detections | None = None
+    known: tuple[str, Path, Detections] | None = None
     amount = 0
     for file in files:
         name = file.relative_to(path).with_suffix("").as_posix() if path.is_dir() else file.stem
@@ -55,19 +54,15 @@ def read_detections(path: Path) -> Detections:
         check_limit("people", amount, "people and images")
         if (format := KEYPOINTS.of_content(source)) is None:
             raise CaptureError(file, "", f"no keypoints: expected those of {KEYPOINTS.listed()}")
-        if source.json != []:  # which several tools write where nobody is
-            tool = tool or (format.about, file)
-            if tool[0] != format.about:
-                problem = f"of {format.about}, but {tool[1].name} is of {tool[0]}: expected files of one tool"
-                raise CaptureError(file, "", problem)
         found = format(source, format)
         images += found.images
-        if found.set is not None:
-            known = known or found
-            if known.set is not found.set:
-                problem = f"{len(found.set.names)} points, but another file has {len(known.set.names)}"
-                raise CaptureError(file, "", f"{problem}: expected one set of keypoints")
-    return Detections(None, tuple(images)) if known is None else dataclasses.replace(known, images=tuple(images))
+        if found.set is not None:  # somebody was found
+            what = f"{len(found.set.names)} points of {format.about}"
+            known = known or (what, file, found)
+            if what != known[0]:
+                problem = f"{what}, but {known[1].name} has {known[0]}: expected one set of one tool"
+                raise CaptureError(file, "", problem)
+    return Detections(None, tuple(images)) if known is None else dataclasses.replace(known[2], images=tuple(images))
 
 
 def _amount(content: Any) -> int:

@@ -31,7 +31,6 @@ from humangs_jax.data.datasets.subject import BodyParameters, FileBody, Photo, P
 from humangs_jax.data.datasets.thuman import (
     FIT_MESH,
     fit_error,
-    fitted_body,
     open_thuman,
     read_fit,
     read_fit_mesh,
@@ -274,7 +273,7 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     """What is written of a scan; its views are rendered when they are asked for. Raises: ValueError naming file and key."""
     scan_file, fit_file = scan_files(source, name)
     fit = read_fit(fit_file, body)
-    fitted = fitted_body(fit, body)
+    fitted = next(posed_people(body.model, fit.parameters, fit.scale))
     mesh, faces = read_fit_mesh(fit_file.with_name(FIT_MESH))
     error = fit_error(fitted, mesh, fit)
     scan = read_scan(scan_file)
@@ -293,8 +292,7 @@ def scan_content(source: Path, name: str, body: FileBody, settings: Settings) ->
     }
     views = (View(f"{i:03d}", 0, K, pose, render(pose)) for i, pose in enumerate(cameras))
     posed = dataclasses.replace(fitted, vertices=mesh)
-    parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
-    return Content(transform, [posed], faces, parameters, fit.scale, views, known)
+    return Content(transform, [posed], faces, fit.parameters, fit.scale, views, known)
 
 
 def _make_video(body: FileBody, folder: Path, name: str, source: Path, settings: Settings, progress: bool) -> None:
