@@ -1,6 +1,5 @@
 """Crops and backgrounds of the protocols against other implementations, on random images and masks."""
 
-import dataclasses
 import typing
 
 import numpy as np
@@ -12,7 +11,6 @@ from humangs_jax.cli.training import Evaluate
 from humangs_jax.evaluation.scores import (
     PROTOCOLS,
     CentredWindow,
-    EvaluationProtocol,
     MaskBox,
     SquareBox,
     WholeFrame,
@@ -36,7 +34,7 @@ def bounds(inside):
 
 
 def test_the_presets_are_those_of_the_table():
-    """shared facts: background, crop, mask on prediction, LPIPS, SSIM."""
+    """Background, crop, mask on prediction, LPIPS, SSIM: docs/evaluation.md."""
     table = {
         "humangs": ("white", WholeFrame(), None, False, ("vgg",), GAUSSIAN),
         "animatable-gaussians": ("white", WholeFrame(), SquareBox(50, 512), False, ("vgg",), UNIFORM),
@@ -49,23 +47,16 @@ def test_the_presets_are_those_of_the_table():
     fields = ("background", "crop", "lpips_crop", "masked", "lpips", "ssim")
     assert {name: tuple(getattr(p, field) for field in fields) for name, p in PROTOCOLS.items()} == table
     assert [name for name, p in PROTOCOLS.items() if p.needs_masks] == ["animatable-gaussians", "ghg", "giga", "lhm++"]
-    own = dataclasses.replace(PROTOCOLS["lhm"], lpips=())
+    assert [PROTOCOLS[name].behind for name in ("lhm", "ghg", "lvsm")] == [1.0, 0.0, 1.0]
     assert typing.get_args(typing.get_type_hints(Evaluate)["protocol"]) == tuple(PROTOCOLS)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        own.masked = True  # ty: ignore[invalid-assignment]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_mask_box(seed):
-    image, mask = blob(seed, 90, 70)
-    (top, bottom), (left, right) = bounds(mask > 0.5)
-    np.testing.assert_array_equal(MaskBox().cut(image, mask, 0.0), image[top : bottom + 1, left : right + 1])
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_square_box(seed):
     """Padded by hand, resampled by scipy: sample i of n lies at (i + 1/2) of / n - 1/2, and the rim goes on as it is."""
     image, mask = blob(seed, 130, 110)
+    (top, bottom), (left, right) = bounds(mask > 0.5)
+    np.testing.assert_array_equal(MaskBox().cut(image, mask, 0.0), image[top : bottom + 1, left : right + 1])
     margin, side = 9, 64
     (top, bottom), (left, right) = bounds(mask > 0)
     rows = slice(max(0, top - margin), min(130, bottom + margin))
@@ -103,7 +94,3 @@ def test_the_centred_window_is_of_the_published_size():
     image, mask = blob(1, 256, 256)
     assert PROTOCOLS["ghg"].crop.cut(image, mask, 0.0).shape == (1000, 500, 3)
     assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (1000, 400, 3)  # narrower than the window
-
-
-def test_only_black_protocols_have_black_behind():
-    assert [EvaluationProtocol(name).behind for name in ("white", "black", "dataset")] == [1.0, 0.0, 1.0]

@@ -3,12 +3,10 @@
 import dataclasses
 import logging
 
-import numpy as np
 import pytest
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.network.runtime import Runtime
 from humangs_jax.training import config
 from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, tiny
 from humangs_jax.training.sources import training_people
@@ -30,17 +28,15 @@ def test_examples_are_counted_over_stages():
     assert [STAGED.examples_before(step) for step in (0, 1, 4, 5, 8, 10)] == [0, 3, 12, 14, 20, 24]
 
 
-@pytest.mark.parametrize("starts", [(0,), (5, 3), (4, 4), (10,)])
+@pytest.mark.parametrize("starts", [(5, 3), (4, 4), (10,)])
 def test_stages_out_of_order_are_refused(starts):
-    with pytest.raises(ValueError, match=r"stages start at|Stage\.start 0: expected 1 to"):
+    with pytest.raises(ValueError, match="stages start at"):
         dataclasses.replace(tiny(), steps=10, stages=tuple(Stage(start) for start in starts))
 
 
 def test_sizes_that_do_not_fit_are_refused_before_the_run():
     with pytest.raises(ValueError, match="not a multiple of patch_size"):
         dataclasses.replace(tiny(), steps=10, stages=(Stage(4, image_size=65),))
-    with pytest.raises(ValueError, match="microbatch_size 0"):
-        dataclasses.replace(tiny(), microbatch_size=0)
 
 
 @pytest.mark.parametrize("name", sorted(config.PRESETS))
@@ -53,11 +49,9 @@ def test_runs_survive_json(name):
     ("text", "message"),
     [
         ('{"stages": [{"start": 5, "size": 3}]}', r"config\.stages\[0\]\.size: Stage has no such field"),
-        ('{"optimizer": {"betas": [0.9]}}', r"config\.optimizer\.betas: expected tuple.*, got \[0\.9\]"),
-        ('{"views": {"input_counts": [4, "6"]}}', r"config\.views\.input_counts\[1\]: expected int, got '6'"),
-        ('{"ema_decay": "much"}', r"config\.ema_decay: expected float, got 'much'"),
-        ('{"model": {"image_size": 512}}', r"config\.model\.image_size: HumanGSConfig has no such field"),
-        ('{"steps": 2', "config.json: the configuration is not JSON"),
+        ('{"optimizer": {"name": "sgd"}}', r"config\.optimizer\.name: expected .*adamw.*, got 'sgd'"),
+        ('{"model": {"runtime": {"dtype": "float16"}}}', "float16: gradients underflow"),
+        ('{"steps": 2', "the configuration is not JSON"),
     ],
 )
 def test_errors_name_file_and_field(text, message, tmp_path):
@@ -85,21 +79,3 @@ def test_a_loss_without_its_network_gives_way_and_says_so(caplog):
 def test_nobody_to_train_on_is_an_error(tmp_path, body):
     with pytest.raises(ValueError, match="nobody to train on"):
         training_people(None, 0, tmp_path, body)
-
-
-def test_float16_is_refused_for_training(tmp_path):
-    with pytest.raises(ValueError, match="float16: gradients underflow"):
-        dataclasses.replace(tiny(), model=tiny().model.with_runtime(dtype="float16"))
-    file = tmp_path / "config.json"
-    file.write_text(config_to_json(tiny()).replace('"dtype": "float32"', '"dtype": "float16"'))
-    with pytest.raises(ValueError, match=r"config\.json: .*float16: gradients underflow") as caught:
-        read_config(file)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("dtype", ["half", "float64", np.float16])
-def test_other_names_of_number_types_are_an_error(dtype):
-    runtime = Runtime()
-    object.__setattr__(runtime, "dtype", dtype)  # the type checker of the tests would say it in its own words
-    with pytest.raises(ValueError, match=r"Runtime: dtype: expected one of 'float32', 'bfloat16', 'float16', got"):
-        runtime.__post_init__()

@@ -77,26 +77,22 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
 
 TOKENS = "encoder.tokenizer.linear"
 IN_BATCH = {
-    "photo": ("inputs.images", (0, 1, 16, 16, 2), TOKENS),  # a pixel of the person; the background is not read
-    "target": ("targets.images", (0, 0, 5, 6, 0), "loss: squared"),
-    "mask": ("targets.masks", (0, 1, 2, 3), "loss: silhouette"),
-    "shape": ("inputs.betas", (0, 0), "position maps"),
-    "pose": ("inputs.rotations", (0, 1, 1, 2), "position maps"),
-    "input camera": ("inputs.cameras.cam_from_world", (0, 1, 0, 3), TOKENS),
-    "target pose": ("targets.rotations", (0, 1, 0, 0), "posed Gaussians"),
-    "target camera": ("targets.cameras.K", (0, 1, 0, 0), "projected splats"),
+    "inputs.images": ((0, 1, 16, 16, 2), TOKENS),  # a pixel of the person; the background is not read
+    "targets.images": ((0, 0, 5, 6, 0), "loss: squared"),
+    "targets.masks": ((0, 1, 2, 3), "loss: silhouette"),
+    "inputs.betas": ((0, 0), "position maps"),
+    "inputs.rotations": ((0, 1, 1, 2), "position maps"),
+    "inputs.cameras.cam_from_world": ((0, 1, 0, 3), TOKENS),
+    "targets.rotations": ((0, 1, 0, 0), "posed Gaussians"),
+    "targets.cameras.K": ((0, 1, 0, 0), "projected splats"),
 }
 
 
-PLANTED = [(what, np.nan) for what in IN_BATCH]
-PLANTED += [pytest.param(what, np.inf, marks=pytest.mark.slow) for what in IN_BATCH if "camera" not in what]
-"""An infinite camera may show nothing at all, which is finite."""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "value"), PLANTED)
-def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, what, value):
-    path, index, stage = IN_BATCH[what]
+@pytest.mark.parametrize("path", IN_BATCH)
+def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, path):
+    index, stage = IN_BATCH[path]
+    value = np.nan if "camera" in path else np.inf  # an infinite camera may show nothing at all, which is finite
     diagnosis = diagnose_step(init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG)
     stored, computed = diagnosis.faults
     assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "batch", path, 1)
@@ -106,13 +102,11 @@ def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, var
 
 IN_PARAMETERS = {
     "encoder.tokenizer.linear.kernel": TOKENS,
-    "encoder.transformer.input_norm.scale": "encoder.transformer.input_norm",
     "encoder.transformer.block_0.norm1.scale": "encoder.transformer.block_0",
     "encoder.transformer.norm.bias": "encoder.transformer.norm",
     "encoder.upsampler.up1.kernel": "encoder.upsampler.up1",
     "reader.kernel": "reader",
     "decoder.trunk_1.kernel": "decoder.trunk_1",
-    "decoder.geometry_out.bias": "decoder.geometry_out",
 }
 
 
@@ -122,26 +116,17 @@ def test_a_bad_parameter_is_named_and_the_stage_that_uses_it(body, batch, variab
     state = init_state(CONFIG, variables)
     state = replace(state, params=with_leaf(state.params, path, planted(np.nan)))
     stored, computed = diagnose_step(state, batch, body, CONFIG).faults
-    assert (stored.direction, stored.stage, stored.leaf.name) == ("stored", "parameters", path)
-    assert stored.leaf.bad == 1 and not any(stored.leaf.first)
+    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "parameters", path, 1)
     assert (computed.direction, computed.stage) == ("forward", IN_PARAMETERS[path])
 
 
-BLOCK = "encoder.transformer.block_1"
-EXPLODING = {
-    BLOCK: [f"{BLOCK}.mlp_in.kernel", f"{BLOCK}.mlp_out.kernel"],
-    "decoder.trunk_1": ["decoder.trunk_0.kernel", "decoder.trunk_1.kernel"],
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", EXPLODING)
-def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, variables, stage):
-    state = init_state(CONFIG, variables)
-    for path in EXPLODING[stage]:
-        state = replace(state, params=with_leaf(state.params, path, lambda x: 1e25 * x))
+def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, variables):
+    state, block = init_state(CONFIG, variables), "encoder.transformer.block_1"
+    for name in ("mlp_in", "mlp_out"):
+        state = replace(state, params=with_leaf(state.params, f"{block}.{name}.kernel", lambda x: 1e25 * x))
     (fault,) = diagnose_step(state, batch, body, CONFIG).faults
-    assert (fault.direction, fault.stage) == ("forward", stage)
+    assert (fault.direction, fault.stage) == ("forward", block)
 
 
 @pytest.mark.slow
@@ -242,7 +227,6 @@ def test_going_back_the_innermost_last_stage_with_good_gradients_behind_it_is_bl
     assert of(worse).fault == Fault("forward", "loss", number("", 1)[""])
 
 
-@pytest.mark.slow
 def test_numbers_of_arrays():
     leaf = Leaf.of("x", np.asarray([[3.0, np.inf], [np.nan, -4.0]], np.float32))
     assert leaf == Leaf("x", 2, (0, 1), -4.0, 3.0, 3.5, 5.0)
@@ -300,13 +284,6 @@ def test_a_stage_whose_gradient_alone_is_bad_is_named(monkeypatch, body, batch, 
 
 
 @pytest.mark.slow
-def test_an_infinite_weight_of_a_loss_is_named(body, batch, variables):
-    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, silhouette=np.inf))
-    (fault,) = diagnose_step(init_state(config, variables), batch, body, config).faults
-    assert (fault.direction, fault.stage, fault.leaf.name) == ("forward", "loss", "")
-
-
-@pytest.mark.slow
 def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypatch, body, batch, variables):
     networks = random_networks()
     loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
@@ -318,10 +295,7 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypat
     stages = {stage.name: stage for stage in whole.stages}
     for name in ("perceptual", "lpips"):
         assert stages[f"loss: {name}"].values[""].mean == pytest.approx(float(metrics[name]), rel=BFLOAT16)
-    head = networks.lpips.heads[2].at[5].set(jnp.nan)
-    networks = replace(
-        networks, lpips=replace(networks.lpips, heads=(*networks.lpips.heads[:2], head, *networks.lpips.heads[3:]))
-    )
+    networks = with_leaf(networks, "lpips.heads.2", planted(jnp.nan, 5))
     stored, computed = diagnose_step(init_state(config, variables), batch, body, config, networks).faults
     assert (stored.stage, stored.leaf.name, stored.leaf.first) == ("loss networks", "lpips.heads.2", (5,))
     assert (computed.direction, computed.stage) == ("forward", "loss: lpips")

@@ -75,13 +75,11 @@ def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
     assert values["validation/sheet"][1].image.width == 16
 
 
-def test_numbers_that_are_not_finite_are_no_json(tmp_path):
+def test_numbers_that_are_not_finite_are_no_json_and_a_full_disk_names_the_log(tmp_path):
     with RunLog(tmp_path, 0, 10, progress=False) as log:
         log.event(3, "skipped", "skipped", loss=float("nan"), grad_norm=2.0)
     assert (tmp_path / "log.jsonl").read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
-
-
-def test_a_full_disk_names_the_log(tmp_path):
+    (tmp_path / "log.jsonl").unlink()
     (tmp_path / "log.jsonl").symlink_to("/dev/full")
     with pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"), RunLog(tmp_path, 0, 10, progress=False) as log:
         log.event(3, "skipped", "skipped")
@@ -103,47 +101,36 @@ def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
     order = [captures[i] for epoch in (0, 1) for i in subject_order(0, epoch, len(captures))]
     assert one.endswith(f"the first at [0, 1, 2, 0]: nan ({order[3]})") and "sample 1: targets.images: " in one
     assert "sample 0: inputs.masks: expected numbers in [0, 1]" in other and other.endswith(f"({order[4]})")
-    state = TrainState(jnp.asarray(0), {}, {}, GuardState(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()), ()), None)
-    metrics = {"skipped": jnp.asarray(1), "nonfinite": jnp.asarray(1), "loss": jnp.asarray(jnp.nan)}
-    with RunLog(tmp_path, 0, 100, progress=False) as log:
-        watch = Watch(log, state)
-        watch(2, metrics | {"grad_norm": jnp.zeros(())}, lambda: bad_samples(loader, 1))
-        watch.look()
-    (event,) = read(tmp_path / "log.jsonl")
+    (event,) = watched(tmp_path, [(2, 1, 1, np.nan, 0.0)], lambda: bad_samples(loader, 1))
     assert event["samples"] == [one] and one in capsys.readouterr().out
 
 
-def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
-    guard = GuardState(jnp.asarray(2), jnp.asarray(2), jnp.zeros(()), ())
-    state = TrainState(jnp.asarray(0), {}, {}, guard, None)
-    metrics = lambda skipped, nonfinite: {
-        "skipped": jnp.asarray(skipped),
-        "nonfinite": jnp.asarray(nonfinite),
-        "loss": jnp.asarray(jnp.nan if skipped > 2 else 1.0),
-        "grad_norm": jnp.asarray(1.0),
-    }
-    with RunLog(tmp_path, 0, 100, progress=False) as log:
+def watched(folder, steps, bad_samples=list, before=0):
+    """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of the gradient."""
+    names = ("skipped", "nonfinite", "loss", "grad_norm")
+    state = TrainState(jnp.asarray(0), {}, {}, GuardState(*[jnp.asarray(before)] * 2, jnp.zeros(()), ()), None)
+    with RunLog(folder, 0, 100, progress=False) as log:
         watch = Watch(log, state)
-        watch(1, metrics(2, 2))
-        watch(2, metrics(2, 3))
-        for i in range(MANY_SKIPPED):
-            watch(3 + i, metrics(3 + i, 4 + i))
+        for done, *numbers in steps:
+            watch(done, dict(zip(names, map(np.asarray, numbers), strict=True)), bad_samples)
         watch.look()
         watch.look()
-    events = [(line["step"], line["event"]) for line in read(tmp_path / "log.jsonl")]
+    return read(folder / "log.jsonl")
+
+
+def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
+    bad = [(3 + i, 3 + i, 4 + i, np.nan, 1.0) for i in range(MANY_SKIPPED)]
+    events = watched(tmp_path, [(1, 2, 2, 1.0, 1.0), (2, 2, 3, 1.0, 1.0), *bad], before=2)
     skipped = [(3 + i, "skipped") for i in range(MANY_SKIPPED)]
-    assert events == [(2, "nonfinite"), *skipped, (2 + MANY_SKIPPED, "stuck")]
+    assert [(line["step"], line["event"]) for line in events] == [
+        (2, "nonfinite"),
+        *skipped,
+        (2 + MANY_SKIPPED, "stuck"),
+    ]
     assert "--diagnose" in capsys.readouterr().out
 
 
 def test_a_gradient_that_stays_0_is_reported_once(tmp_path, capsys):
-    state = TrainState(jnp.asarray(0), {}, {}, GuardState(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()), ()), None)
-    metrics = {name: np.zeros(()) for name in ("skipped", "nonfinite", "loss", "grad_norm")}
-    with RunLog(tmp_path, 0, 100, progress=False) as log:
-        watch = Watch(log, state)
-        for i in range(2 * MANY_SKIPPED):
-            watch(1 + i, metrics | {"grad_norm": np.asarray(float(i == 0))})
-        watch.look()
-    events = [(line["step"], line["event"]) for line in read(tmp_path / "log.jsonl")]
-    assert events == [(1 + MANY_SKIPPED, "stuck")]
+    events = watched(tmp_path, [(1 + i, 0, 0, 0.0, float(i == 0)) for i in range(2 * MANY_SKIPPED)])
+    assert [(line["step"], line["event"]) for line in events] == [(1 + MANY_SKIPPED, "stuck")]
     assert "had a gradient of 0" in capsys.readouterr().out

@@ -28,38 +28,36 @@ def lines(out):
 
 
 @pytest.fixture(scope="module")
-def whole(body, captures, variables, tmp_path_factory):
+def run(body, captures, variables):
+    """`train` on two of the captures, validated on the third."""
+    options = {"training": captures[:2], "validation": captures[2:], "variables": variables, "progress": False}
+    return lambda out, config=CONFIG, **how: train(config, body, out=out, **options | how)
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
     """A run of four steps in one go, and its folder."""
     out = tmp_path_factory.mktemp("whole")
-    options = {"validation": captures[2:], "variables": variables, "progress": False}
-    return train(CONFIG, body, captures[:2], out, stop_at=4, **options), out
+    return run(out, stop_at=4), out
+
+
+def losses(out):
+    return {line["step"]: line["loss"] for line in lines(out) if "loss" in line}
 
 
 @pytest.mark.slow
-def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(body, captures, variables, tmp_path, whole, same):
-    options = {"validation": captures[2:], "variables": variables, "progress": False}
-    state = train(CONFIG, body, captures[:2], tmp_path, stop_at=2, **options)
-    assert int(state.step) == 2
-    resumed = train(CONFIG, body, captures[:2], tmp_path, stop_at=4, **options)
-    assert int(resumed.step) == 4 and same(resumed, whole[0])
-    losses = lambda out: [line["loss"] for line in lines(out) if "loss" in line]
-    assert losses(tmp_path) == losses(whole[1]) and len(losses(tmp_path)) == 4
+def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(run, tmp_path, whole, same):
+    assert int(run(tmp_path, stop_at=2).step) == 2
+    assert same(run(tmp_path, stop_at=4), whole[0]) and losses(tmp_path) == losses(whole[1])
+    before = len(lines(tmp_path))
+    assert same(run(tmp_path, stop_at=4), whole[0]) and len(lines(tmp_path)) == before  # there is nothing left to do
 
 
 @pytest.mark.slow
-def test_a_finished_run_stays_as_it_is(body, captures, variables, whole, same):
-    before = len(lines(whole[1]))
-    again = train(CONFIG, body, captures[:2], whole[1], variables=variables, stop_at=4, progress=False)
-    assert same(again, whole[0])
-    assert len(lines(whole[1])) == before
-
-
-@pytest.mark.slow
-def test_a_finished_run_goes_on_when_it_gets_more_steps(body, captures, variables, tmp_path):
-    options = {"variables": variables, "progress": False}
-    assert int(train(dataclasses.replace(CONFIG, steps=2), body, captures[:2], tmp_path, **options).step) == 2
-    assert int(train(dataclasses.replace(CONFIG, steps=3), body, captures[:2], tmp_path, **options).step) == 3
-    assert [line["step"] for line in lines(tmp_path) if "loss" in line] == [1, 2, 3]
+def test_a_finished_run_goes_on_when_it_gets_more_steps(run, tmp_path):
+    for steps in (2, 3):
+        run(tmp_path, dataclasses.replace(CONFIG, steps=steps), validation=())
+    assert list(losses(tmp_path)) == [1, 2, 3]
 
 
 @pytest.mark.slow
@@ -95,29 +93,25 @@ def quick(step=None):
     return made
 
 
-@pytest.mark.parametrize(("at", "number"), [(1, signal.SIGINT), (2, signal.SIGTERM), (3, signal.SIGINT)])
-def test_a_signal_ends_a_loop_of_runs_when_all_is_saved(at, number, body, captures, variables, tmp_path, monkeypatch, caplog):
+@pytest.mark.parametrize(("at", "number"), [(1, signal.SIGINT), (3, signal.SIGTERM)])
+def test_a_signal_ends_a_run_when_all_is_saved(at, number, run, tmp_path, monkeypatch, caplog):
     """Also one that comes in the last step, which is then done."""
     monkeypatch.setattr(loop, "train_step", quick(lambda done: done == at and signal.raise_signal(number)))
-    options = {"variables": variables, "progress": False}
-    begun, handler = [], signal.getsignal(number)
+    handler = signal.getsignal(number)
     with caplog.at_level(logging.WARNING), pytest.raises(loop.TrainingInterrupted, match=f"after {at} of 3 steps") as stopped:
-        for name in ("a", "b"):
-            begun.append(name)
-            train(dataclasses.replace(CONFIG, steps=3), body, captures[:2], tmp_path / name, **options)
-    assert begun == ["a"] and signal.getsignal(number) is handler and isinstance(stopped.value, KeyboardInterrupt)
+        run(tmp_path, dataclasses.replace(CONFIG, steps=3, validate_every=4), validation=())
+    assert signal.getsignal(number) is handler and isinstance(stopped.value, KeyboardInterrupt)  # ends a loop of runs, too
     assert int(stopped.value.state.step) == at and "stopping after this step" in caplog.text
-    checkpoints = Checkpoints(tmp_path / "a" / "checkpoints")
-    assert checkpoints.steps[-1] == at and (tmp_path / "a" / "weights.safetensors").is_file()
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert checkpoints.steps[-1] == at and (tmp_path / "weights.safetensors").is_file()
     checkpoints.close()
 
 
-def test_what_was_dropped_is_explained(body, captures, variables, tmp_path, monkeypatch, capsys):
+def test_what_was_dropped_is_explained(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(loop, "train_step", quick())
     numbers = {"psnr": 20.0, "dropped_tokens": 1.0, "overflow": 0.0}
     monkeypatch.setattr(loop, "validate", lambda *_: (numbers, [np.zeros((2, 32, 32, 3))]))
-    options = {"variables": variables, "validation": captures[2:], "stop_at": 2}
-    train(CONFIG, body, captures[:2], tmp_path, **options)
+    run(tmp_path, stop_at=2, progress=True)
     assert f"dropped_tokens 1 ({loop.DROPPED['dropped_tokens']}), overflow 0" in " ".join("".join(capsys.readouterr()).split())
 
 
@@ -134,45 +128,33 @@ def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypa
     assert (jax.random.key_data(of(7)) == jax.random.key_data(expected)).all()
 
 
-@pytest.mark.slow
-def test_another_configuration_is_refused_before_anything_runs(body, captures, whole):
-    with pytest.raises(ValueError, match="started with seed = 0, not 1"):
-        train(dataclasses.replace(CONFIG, seed=1), body, captures[:2], whole[1], progress=False)
-
-
-@pytest.mark.slow
-def test_a_broken_folder_is_named_and_logged(body, captures, variables, tmp_path, caplog):
-    broken = tmp_path / "broken"
+def test_a_broken_folder_is_named_and_another_configuration_refused(body, captures, run, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(loop, "train_step", quick())
+    broken, out = tmp_path / "broken", tmp_path / "out"
     broken.mkdir()
     (broken / "capture.json").write_text("{}")
-    with caplog.at_level(logging.WARNING):
-        folders, out = [broken, captures[0]], tmp_path / "out"
-        train(CONFIG, body, folders, out, variables=variables, stop_at=2, progress=False)
-    assert str(broken) in caplog.text
-    assert lines(tmp_path / "out")[-1]["broken_folders"] == 1
-
-
-@pytest.mark.slow
-def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(body, captures, variables, tmp_path, whole, same):
     asked = []
 
     def make(config):
         asked.append(config)
-        return captured_people(captures[:2], body)(config)
+        return captured_people([broken, captures[0]], body)(config)
 
-    state = train(CONFIG, body, make, tmp_path, variables=variables, stop_at=4, progress=False)
-    assert asked == [CONFIG] and same(state.params, whole[0].params)
+    with caplog.at_level(logging.WARNING):
+        run(out, training=make, validation=(), stop_at=2)
+    assert asked == [CONFIG] and str(broken) in caplog.text and lines(out)[-1]["broken_folders"] == 1
+    with pytest.raises(ValueError, match="started with seed = 0, not 1"):
+        run(out, dataclasses.replace(CONFIG, seed=1))
 
 
-def test_sizes_of_a_later_stage_are_tried_before_the_run(body, captures, variables, tmp_path):
+def test_sizes_of_a_later_stage_are_tried_before_the_run(run, tmp_path):
     config = dataclasses.replace(CONFIG, batch_size=2, microbatch_size=2, stages=(Stage(50, batch_size=3),))
     with pytest.raises(ValueError, match="3 subjects per device cannot be divided into microbatches of 2"):
-        train(config, body, captures[:2], tmp_path, variables=variables, progress=False)
+        run(tmp_path, config)
     assert not (tmp_path / "log.jsonl").exists()
 
 
 @pytest.mark.slow
-def test_resume_in_a_later_stage_with_changing_numbers_of_views(body, captures, variables, tmp_path, same):
+def test_resume_in_a_later_stage_with_changing_numbers_of_views(run, tmp_path, same):
     config = dataclasses.replace(
         CONFIG,
         views=dataclasses.replace(CONFIG.views, input_counts=(1, 2, 3)),
@@ -180,11 +162,9 @@ def test_resume_in_a_later_stage_with_changing_numbers_of_views(body, captures, 
         steps=6,
         stages=(Stage(2, image_size=16, target_size=32, batch_size=2, token_capacity=12),),
     )
-    options = {"validation": captures[2:], "variables": variables, "progress": False}
-    whole = train(config, body, captures[:2], tmp_path / "whole", **options)
+    whole = run(tmp_path / "whole", config)
     for stop in (1, 3, 4, 6):
-        resumed = train(config, body, captures[:2], tmp_path / "parts", stop_at=stop, **options)
+        resumed = run(tmp_path / "parts", config, stop_at=stop)
     assert same(resumed, whole)
-    losses = [[line["loss"] for line in lines(tmp_path / name) if "loss" in line] for name in ("whole", "parts")]
-    assert losses[0] == losses[1] and len(losses[0]) == 6
+    assert losses(tmp_path / "parts") == losses(tmp_path / "whole") and len(losses(tmp_path / "whole")) == 6
     assert load_weights(tmp_path / "whole" / "weights.safetensors")[1].image_size == 16

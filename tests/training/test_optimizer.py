@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rounding import bound
 
 from humangs_jax.training.state import (
@@ -72,15 +70,11 @@ def test_a_bad_step_changes_nothing_and_is_counted(gradient, value):
     assert int(state.skipped) == 1 and not bool(jnp.all(params["bias"] == 1))
 
 
-@given(st.lists(st.floats(width=32), min_size=1, max_size=20))
-def test_gradients_become_finite_and_finite_ones_stay(values):
-    given_ = np.asarray(values, np.float32)
-    cleaned = np.asarray(finite_gradients({"x": jnp.asarray(given_)})["x"])
-    finite = np.isfinite(given_)
-    np.testing.assert_array_equal(cleaned[finite], given_[finite])
-    assert (cleaned[np.isnan(given_)] == 0).all()
-    infinite = np.isinf(given_)
-    np.testing.assert_array_equal(cleaned[infinite], np.float32(INFINITY_STAND_IN) * np.sign(given_[infinite]))
+def test_gradients_become_finite_and_finite_ones_stay():
+    finite, others = [0.0, -1e-45, 3e38, -2.5], [np.nan, np.inf, -np.inf]
+    cleaned = finite_gradients({"x": jnp.asarray([*finite, *others], jnp.float32)})["x"]
+    expected = np.asarray([*finite, 0.0, INFINITY_STAND_IN, -INFINITY_STAND_IN], np.float32)
+    np.testing.assert_array_equal(cleaned, expected)
 
 
 def test_bad_entries_alone_skip_no_step():

@@ -48,35 +48,26 @@ def without_person(views, which):
     )
 
 
-NOTHING_TO_SEE = {
-    "one input": lambda batch: replace(batch, inputs=without_person(batch.inputs, slice(1, 2))),
-    "one target": lambda batch: replace(batch, targets=without_person(batch.targets, slice(1, 2))),
-    "all inputs": lambda batch: replace(batch, inputs=without_person(batch.inputs, slice(None))),
-    "all targets": lambda batch: replace(batch, targets=without_person(batch.targets, slice(None))),
-    "everything": lambda batch: replace(
-        batch, inputs=without_person(batch.inputs, slice(None)), targets=without_person(batch.targets, slice(None))
-    ),
-}
+EVERY, SECOND = slice(None), slice(1, 2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("what", NOTHING_TO_SEE)
-def test_views_of_background_alone(body, batch, variables, what):
-    _, metrics = step_without_harm(init_state(CONFIG, variables), NOTHING_TO_SEE[what](batch), body)
-    if what in ("all targets", "everything"):
+@pytest.mark.parametrize(
+    "which", [{"inputs": SECOND}, {"targets": SECOND}, {"inputs": EVERY}, {"inputs": EVERY, "targets": EVERY}], ids=str
+)
+def test_views_of_background_alone(body, batch, variables, which):
+    seen = replace(batch, **{views: without_person(getattr(batch, views), some) for views, some in which.items()})
+    _, metrics = step_without_harm(init_state(CONFIG, variables), seen, body)
+    if which.get("targets") == EVERY:
         assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9  # background is drawn as it was in the photo
 
 
-def moved(views, offset):
-    """The subject moved, and not the cameras."""
-    return replace(views, translations=views.translations + jnp.asarray(offset))
-
-
-@pytest.mark.parametrize("offset", [(OUTSIDE, 0, 0), (0, 0, OUTSIDE), (0, -OUTSIDE, 0), (0, 0, 1e6)], ids=str)
+@pytest.mark.parametrize("offset", [(OUTSIDE, 0, 0), (0, 0, OUTSIDE), (0, 0, 1e6)], ids=str)
 def test_a_subject_outside_of_the_frame_or_behind_the_camera(body, batch, variables, offset):
     """The photos show a person where the poses say that there is none."""
-    away = replace(batch, inputs=moved(batch.inputs, offset), targets=moved(batch.targets, offset))
-    step_without_harm(init_state(CONFIG, variables), away, body)
+    moved = lambda views: replace(views, translations=views.translations + jnp.asarray(offset))
+    step_without_harm(
+        init_state(CONFIG, variables), replace(batch, inputs=moved(batch.inputs), targets=moved(batch.targets)), body
+    )
 
 
 def test_a_camera_inside_of_the_body(body, batch, variables):
@@ -91,8 +82,7 @@ def test_black_photos_and_masks_that_cover_all(body, batch, variables):
     step_without_harm(init_state(CONFIG, variables), replace(batch, targets=full(batch.targets)), body)
 
 
-@pytest.mark.parametrize("views", ["inputs", "targets"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize(("views", "value"), [("inputs", np.nan), ("targets", np.inf), ("inputs", 1e30), ("targets", 1e30)])
 def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, views, value, same):
     """A pixel of the person, so that the network sees it."""
     row, column = np.argwhere(np.asarray(getattr(batch, views).masks[0, 0]) > 0.9)[0]
@@ -122,15 +112,14 @@ def with_geometry(state, free_offset=0.0, log_scale=None):
     return replace(state, params=params)
 
 
-@pytest.mark.parametrize("log_scale", [-1e4, -100.0, 10.0, 1e4, 1e30])
+@pytest.mark.parametrize("log_scale", [-1e4, 10.0, 1e30])
 def test_gaussians_of_no_size_and_of_any(body, batch, variables, log_scale):
     step_without_harm(with_geometry(init_state(CONFIG, variables), log_scale=log_scale), batch, body)
 
 
 def decoder_of(**changes):
-    return dataclasses.replace(
-        CONFIG, model=CONFIG.model.with_parts(decoder=dataclasses.replace(CONFIG.model.architecture.decoder, **changes))
-    )
+    decoder = dataclasses.replace(CONFIG.model.architecture.decoder, **changes)
+    return dataclasses.replace(CONFIG, model=CONFIG.model.with_parts(decoder=decoder))
 
 
 @pytest.mark.slow
@@ -149,8 +138,8 @@ def test_one_view(body, captures):
     state = init_state(config)
     for step in range(3):
         state, _ = step_without_harm(state, batch_of(body, captures, config, step), body, config)
-    nobody = NOTHING_TO_SEE["all inputs"](batch_of(body, captures, config))
-    step_without_harm(state, nobody, body, config)
+    batch = batch_of(body, captures, config)
+    step_without_harm(state, replace(batch, inputs=without_person(batch.inputs, EVERY)), body, config)
 
 
 @pytest.mark.slow
