@@ -180,11 +180,6 @@ def test_what_is_wrong_is_named(change, message, tmp_path):
         load_lpips("squeeze", path)
 
 
-def test_twice_the_same_network_is_no_problem():
-    tensors = state("squeeze")
-    assert find_layers(tensors | {f"copy.{key}": x for key, x in tensors.items()}, "SqueezeNet 1.1").keys() == tensors.keys()
-
-
 def test_another_network_is_recognised():
     shapes = {f"features.{key}": np.zeros(shape) for key, shape in expected_tensors("VGG-16").items()}
     with pytest.raises(ValueError, match=r"'features.16.weight' of VGG-19 is missing .*; it looks like VGG-16"):

@@ -15,8 +15,13 @@ TOLERANCES = {"float32": 2e-5, "float64": 1e-6}
 reference is stored as float32: half a rounding step is 6e-8."""
 
 
-@pytest.mark.parametrize("dtype", TOLERANCES)
-@pytest.mark.parametrize("name", golden.POOLS)
+SLOW = {("golden_a", "float64"), ("golden_b", "float32")}
+CASES = [
+    pytest.param(name, dtype, marks=[pytest.mark.slow] * ((name, dtype) in SLOW)) for name in golden.POOLS for dtype in TOLERANCES
+]
+
+
+@pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_every_stage_agrees(name, dtype):
     checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):

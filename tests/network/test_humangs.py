@@ -74,19 +74,6 @@ def test_the_published_network_has_99_million_parameters():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("views", "vertices", "tight", "free", "joints"), [(1, 5, 1, 0, None), (3, 40, 0, 2, 7), (6, 1, 2, 3, 55)]
-)
-def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free, joints):
-    config = TINY.with_parts(decoder=dataclasses.replace(DECODER, tight=tight, free=free, skinning_joints=joints))
-    inputs = jax.eval_shape(lambda: random_inputs(0, views, vertices))
-    _, outputs = jax.eval_shape(lambda v, x: run(v, x, config), expected_variables(config), inputs)
-    count = vertices * (tight + free)
-    assert outputs.gaussians.opacities.shape == (count,) and outputs.tight_offsets.shape == (vertices, tight, 3)
-    assert (outputs.skinning_offsets is None) if joints is None else (outputs.skinning_offsets.shape == (count, joints))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("class_token", [True, False])
 @pytest.mark.parametrize("sample_rgb", [True, False])
 def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
@@ -237,17 +224,6 @@ def test_padding_views_change_nothing(config, train):
     (outputs, statistics), (expected, expected_statistics) = apply(padded(inputs, 3)), apply(inputs)
     assert close((outputs, statistics), (expected, expected_statistics), 10 * FLOAT32_TOLERANCE)
     assert not close(outputs, apply(replace(padded(inputs, 3), view_count=jnp.asarray(3)))[0], 1e-3)
-
-
-@pytest.mark.slow
-def test_subjects_with_different_numbers_of_views_share_a_batch():
-    subjects = [random_inputs(seed, views) for seed, views in enumerate((1, 3, 2))]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(padded(x, 3) for x in subjects))
-    variables = variables_of(PUBLISHED_LIKE)
-    apply = lambda x: apply_humangs(variables, x, PUBLISHED_LIKE)[0]
-    together = jax.jit(jax.vmap(apply))(batch)
-    for index, subject in enumerate(subjects):
-        assert close(jax.tree.map(lambda x, i=index: x[i], together), jax.jit(apply)(subject), 10 * FLOAT32_TOLERANCE)
 
 
 # gradients and batches

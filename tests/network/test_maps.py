@@ -104,12 +104,12 @@ def test_planes_and_axes():
     positions = jnp.asarray([[0.1, 0.7, -0.6], [-1.0, 1.0, 0.0]])
     x, y, z = positions.T
     expected = jnp.stack([x, y, x, z, y, z], axis=-1)
-    assert np.allclose(sample_triplane(texture, positions), expected, atol=1e-6)
+    assert np.allclose(jax.jit(sample_triplane)(texture, positions), expected, atol=1e-6)
 
 
 def test_background_reads_the_last_texel_and_outside_is_zero():
     texture = jnp.arange(3 * 4 * 4 * 2, dtype=jnp.float32).reshape(3, 4, 4, 2)
-    read = sample_triplane(texture, jnp.asarray([[[1.0, 1, 1], [2, 2, 2]]]))
+    read = jax.jit(sample_triplane)(texture, jnp.asarray([[[1.0, 1, 1], [2, 2, 2]]]))
     assert read.shape == (1, 2, 6)
     assert np.allclose(read[0, 0], texture[:, -1, -1].ravel()) and np.array_equal(read[0, 1], np.zeros(6))
 
@@ -142,7 +142,7 @@ def test_a_batch_of_maps():
     with jax.enable_x64(True):
         x, kernel = random(3, *SHAPE), random(3, 3, SHAPE[-1], FEATURES)
         loss = lambda f: lambda x, kernel: jnp.sum(jnp.sin(f(x, kernel)))
-        gradient = lambda f: jax.vmap(jax.grad(loss(f), (0, 1)), (0, None))(x, kernel)
+        gradient = lambda f: jax.jit(jax.vmap(jax.grad(loss(f), (0, 1)), (0, None)))(x, kernel)
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=FLOAT64, atol=FLOAT64)
         jax.tree.map(close, gradient(convolve), gradient(reference))
 
@@ -250,13 +250,6 @@ def test_a_batch_may_share_its_statistics():
     in_one = lambda x: alone.apply(variables, x, True, mutable=["batch_stats"])[0]
     together = jax.jit(in_one)([x.reshape(-1, *x.shape[2:]) for x in maps])
     assert np.allclose(outputs.reshape(together.shape), together, atol=1e-4)
-
-
-def test_final_features_only():
-    module = Upsampler(dataclasses.replace(CONFIG, features="final"))
-    shapes = jax.eval_shape(module.init, jax.random.key(0), random_maps(depths=1))
-    assert [name for name in shapes["params"] if name.startswith("project")] == ["project_0"]
-    assert shapes["params"]["fuse"]["kernel"].shape == (3, 3, CONFIG.hidden, 2 * CONFIG.hidden)
 
 
 def test_padding_does_not_count_in_the_statistics():

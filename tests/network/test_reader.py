@@ -96,9 +96,8 @@ def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
     inputs = random_inputs(views=3)
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[1].set(-1.0), view_count=jnp.asarray(2))
     maps = jnp.asarray([2.0, 6.0, 50.0])[:, None, None, None] * jnp.ones((3, 32, 32, 1))
-    features = PixelAlignedReader(output_width=None, sample_rgb=True).apply(
-        {}, Encoding(maps, None, jnp.int32(0)), inputs, TINY.with_conventions(pool=pool).run()
-    )
+    reader, how = PixelAlignedReader(output_width=None, sample_rgb=True), TINY.with_conventions(pool=pool).run()
+    features = jax.jit(lambda maps, inputs: reader.apply({}, Encoding(maps, None, jnp.int32(0)), inputs, how))(maps, inputs)
     unit = subject_unit(inputs.canonical_vertices)
     cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
     pixels, visible = project_and_test(cameras, vertices, inputs.depth_maps, inputs.present, "half_pixel")
@@ -116,7 +115,8 @@ def test_at_the_edge_of_a_mask_a_shell_has_the_color_of_the_person_alone():
     images, foreground = jnp.where(mask[:, None], images, 1.0), jnp.broadcast_to(mask, (1, *SIZE[::-1]))
     vertex, normal = (jnp.asarray([[[0.0, 0.0, 2.0]]]), jnp.asarray([[[0.0, 0.0, -1.0]]]))  # at the middle: the mask's edge
     nothing = jnp.full((1, *SIZE[::-1]), -1.0)
-    shells = sample_shells(images, foreground, nothing, camera, vertex, normal, (0.0,), jnp.ones(1, bool), "half_pixel")
+    read_one = jax.jit(lambda *arrays: sample_shells(*arrays, (0.0,), jnp.ones(1, bool), "half_pixel"))
+    shells = read_one(images, foreground, nothing, camera, vertex, normal)
     np.testing.assert_allclose(shells.colors[0, 0], [0.9, 0.6, 0.3], rtol=1e-5)
     np.testing.assert_allclose(shells.inside[0, 0], 0.5, rtol=1e-5)
 
@@ -152,9 +152,13 @@ def scene(views=VIEWS):
     return (jnp.asarray(images), same(mask), same(depths), cameras, same(BODY * normals), same(normals), normals)
 
 
+@jax.jit
+def read_views(arguments, present):
+    return sample_shells(*arguments, DISTANCES, present, "half_pixel")
+
+
 def read(arguments, present=None):
-    present = jnp.ones(len(arguments[0]), bool) if present is None else present
-    return sample_shells(*arguments[:6], DISTANCES, present, "half_pixel")
+    return read_views(arguments[:6], jnp.ones(len(arguments[0]), bool) if present is None else present)
 
 
 def lateral(points, cameras):

@@ -100,7 +100,8 @@ def test_gaussians_choose_their_shell_and_its_color():
 
 def biases_of(decoder, features):
     """Fresh biases of the last layers: what Gaussians start from, but for tiny weights."""
-    params = decoder.init(jax.random.key(0), features, random_inputs(vertices=2), TINY.run())["params"]
+    init = jax.jit(lambda features: decoder.init(jax.random.key(0), features, random_inputs(vertices=2), TINY.run()))
+    params = init(features)["params"]
     return {name: layer["bias"] for name, layer in params.items()}
 
 

@@ -78,7 +78,7 @@ def squared_error(avatar, capture):
     return float(np.mean(np.square(np.clip(drawn, 0, 1) - capture.images)))
 
 
-@pytest.mark.parametrize("times", [1 / 3, 3])
+@pytest.mark.parametrize("times", [1 / 3, pytest.param(3, marks=pytest.mark.slow)])
 def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     """Also if its low-pass is that of smaller or larger pixels than theirs."""
     avatar, capture = person

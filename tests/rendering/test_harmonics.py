@@ -75,10 +75,9 @@ def test_the_direction_is_from_the_camera_to_the_mean_in_the_world():
         assert (expected == 0).any() and project(random_gaussians(0), view).added_colors is None
 
 
-@pytest.mark.parametrize("count", [3, 8, 15])
-def test_a_scene_turned_with_its_camera_looks_the_same(count):
+def test_a_scene_turned_with_its_camera_looks_the_same():
     with jax.enable_x64(True):
-        gaussians, view = with_harmonics(random_gaussians(1), count), camera()
+        gaussians, view = with_harmonics(random_gaussians(1), 15), camera()
         turn = quaternion.to_matrix(quaternion.normalize(jnp.asarray([0.3, -0.5, 0.7, 0.2])))
         move = transform.make(turn, jnp.asarray([1.0, -2.0, 0.5]))
         moved = skin_gaussians(gaussians, jnp.broadcast_to(move, (len(gaussians.means), 4, 4)))

