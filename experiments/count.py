@@ -225,6 +225,5 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 
 
 def public_names(root: Path) -> list[str]:
-    """What `import humangs_jax` offers."""
     tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
     return [each.asname or each.name for node in tree.body if isinstance(node, ast.ImportFrom) for each in node.names]

@@ -297,7 +297,6 @@ def write_blender_sheet(path: Path, folder: Path, python: Path) -> None:
 
 
 def save_sheet(path: Path, images: list) -> None:
-    """Write images of the same height side by side."""
     pixels = np.rint(255 * np.concatenate(images, axis=1)).astype(np.uint8)
     Image.fromarray(pixels).save(path, quality=85, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

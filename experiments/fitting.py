@@ -82,7 +82,6 @@ def _pose_all(model, betas, rotations, translations):
 
 
 def _posed(model, betas, rotations, translations):
-    """Landmarks and joints of all frames."""
     return tuple(np.asarray(x) for x in _pose_all(model, jnp.asarray(betas), rotations, translations))
 
 
@@ -162,7 +161,6 @@ def _people(kind, views, count, frames):
 
 
 def _errors(count, frames, setting):
-    """Millimetres, and seconds."""
     kind, views, noise, outliers = setting
     model, people = _model(kind), _people(kind, views, count, frames)
     seen = observe(people, FIRST, noise, outliers, model)
@@ -294,6 +292,5 @@ def spoiled(model, people, name: str):
 
 
 def moved(case, by):
-    """The case with the person elsewhere."""
     by = np.asarray(by, np.float32)
     return dataclasses.replace(case, joints=case.joints + by, landmarks=case.landmarks + by)

@@ -127,7 +127,6 @@ def view_rows(networks, folder, kind):
 
 
 def projected(points, K, transform):
-    """Pixels of points of the world."""
     seen = (points @ transform[:3, :3].T + transform[:3, 3]) @ K.T
     return seen[:, :2] / seen[:, 2:]
 

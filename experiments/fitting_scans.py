@@ -79,7 +79,6 @@ def scans_table(numbers: dict[str, Any], without_joints: bool) -> str:
 
 
 def fit_one(seed, kind, body, without_joints):
-    """Scores of one scan."""
     true, landmarks, vertices, faces = person(seed, kind, body)
     place, rng = random_place(seed), np.random.default_rng([seed, JOINT_STREAM])
     noisy = place(landmarks + rng.normal(0, NOISE_MM / 1000, landmarks.shape))
@@ -136,7 +135,6 @@ def distances_to_surface(points, vertices, faces):
 
 
 def summary(rows):
-    """Of one kind of scans."""
     mean = lambda name, rows: float(np.mean([row[name] for row in rows])) if rows else None
     good = [row for row in rows if row["vertex_mm"] < SUCCESS]
     return {

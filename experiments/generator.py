@@ -57,7 +57,6 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
 
 
 def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
-    """Pixels of one person in one pose, and shares of faults."""
     posed = sample_pose(make_subject(seed, body), 0)
     rng = np.random.default_rng([seed, 77, 0])
     camera = surroundings.cameras_around(rng, posed.vertices, surroundings.spread_azimuths(rng, 1), size)[0]
@@ -235,7 +234,6 @@ def _near(posed, target, reach, azimuth, elevation):
 
 
 def _in_pairs(rows):
-    """A grid of two columns of rows."""
     half = (len(rows) + 1) // 2
     return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
 

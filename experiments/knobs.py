@@ -54,7 +54,6 @@ PRESETS_HEAD = """
 
 
 def page() -> str:
-    """The page in Markdown."""
     classes = Runtime, Conventions, PatchTransformer, VertexDecoder, SplatConfig, RasterConfig, RefineConfig, TrainConfig
     rows = [row for cls in (*classes, OnTheFlyConfig, Settings) for row in knob_rows(cls)]
     sections = {HEAD: rows, PRESETS_HEAD: preset_rows(), FIELDS_HEAD: field_rows()}

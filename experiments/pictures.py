@@ -32,7 +32,6 @@ DETAIL_PIXELS = 96
 
 
 def cropped(image: np.ndarray) -> np.ndarray:
-    """The middle of an image's width."""
     width = image.shape[1]
     left = round(0.5 * (1 - CROP) * width)
     return image[:, left : width - left]

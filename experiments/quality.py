@@ -162,7 +162,6 @@ def light(run: Run, people: People = People(16)) -> None:
 
 
 def _light_of(start, seed):
-    """Scores by avatar and task of one person."""
     subject, rng = make_subject(seed, start.body), np.random.default_rng([seed, RING])
     posed = [sample_pose(subject, i) for i in range(LIGHT_POSES)]
     rings = [cameras_around(rng, pose.vertices, spread_azimuths(rng, RING), start.size) for pose in posed]

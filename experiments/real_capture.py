@@ -162,7 +162,6 @@ def _numbers(camera: Any, name: str) -> dict[str, float]:
 
 
 def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndarray, "h w 3"]]:
-    """Frames of a video by number."""
     import imageio_ffmpeg
 
     reader = imageio_ffmpeg.read_frames(str(video))
@@ -336,7 +335,6 @@ _lpips = jax.jit(lpips)
 
 @functools.cache
 def _alex() -> Lpips | None:
-    """LPIPS, where the extra `lpips` is installed."""
     return load_lpips("alex") if "alex" in installed_lpips() else None
 
 

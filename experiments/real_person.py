@@ -95,7 +95,6 @@ class Man:
         return load_photos(place, fit_masks=True)
 
     def _fits(self, name: int | str, masks: str, views: tuple[int, ...]) -> FittedCapture:
-        """By the keypoints of some views."""
         photos, keypoints, at = self.photos(name, masks), self.frames[name].keypoints, np.asarray(views)
         assert photos.masks is not None
         confidences = keypoints.confidences[at]
@@ -222,7 +221,6 @@ def _in_room(man, seed, person, way):
 
 
 def start(man: Man) -> Cases:
-    """The whole command."""
     yield "start", str(man.numbers[0]), functools.partial(started, man.data, man.numbers[0])
 
 

@@ -245,7 +245,6 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
 
 
 def readme_times(demo: dict[str, Any]) -> str:
-    """Times of the demo's stages."""
     spent, views = demo["timings"], demo["views"]
     stages = {
         f"reconstruct: {views['input']} photos of {demo['image_size'][0]} px -> {demo['gaussians']:,} Gaussians": "reconstruct",

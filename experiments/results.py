@@ -71,7 +71,6 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def default_alignment(header: Sequence[str]) -> str:
-    """Of a table with these columns."""
     return "l" + "r" * (len(header) - 1)
 
 
@@ -91,7 +90,6 @@ def blocks_of(text: str) -> list[str | dict[str, Any]]:
 
 
 def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
-    """A section in Markdown."""
     return "\n\n".join(block if isinstance(block, str) else markdown_table(**block) for block in blocks)
 
 
@@ -163,14 +161,12 @@ def cores() -> int | None:
 
 
 def cpu_model() -> str:
-    """The processor's name."""
     information = Path("/proc/cpuinfo")
     names = re.findall(r"model name\s*: (.*)", information.read_text()) if information.exists() else []
     return names[0] if names else platform.processor() or platform.machine()
 
 
 def version(package: str) -> str | None:
-    """Of an installed package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

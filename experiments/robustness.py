@@ -45,12 +45,10 @@ class Case:
 
 
 def computed(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """Another type of number for the encoder's products."""
     return lambda variables, config: (variables, config.with_runtime(dtype=dtype))
 
 
 def in_type(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """All variables in another type of number."""
     return lambda variables, config: (jax.tree.map(lambda x: x.astype(dtype), variables), config)
 
 

@@ -40,11 +40,9 @@ class Scene(NamedTuple):
     camera: Camera
 
     def wide(self) -> "Scene":
-        """In float64, where JAX has it."""
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), self)
 
     def chosen(self, which: np.ndarray) -> "Scene":
-        """Some of its Gaussians."""
         return self._replace(gaussians=jax.tree.map(lambda x: x[which], self.gaussians))
 
 
@@ -101,7 +99,6 @@ def outputs(programs: Programs, kept: np.ndarray | None = None) -> dict[str, np.
 
 
 def exact_outputs(scene: Scene) -> dict[str, np.ndarray]:
-    """In float64."""
     with jax.enable_x64(True):
         return outputs(compiled(scene.wide(), DEFAULT_CONFIG)[0])
 
@@ -242,7 +239,6 @@ def splatting_tradeoff(
 
 
 def measure_exact(truth: dict[str, np.ndarray], exact: Programs, repeats: int) -> dict[str, Any]:
-    """Milliseconds and errors."""
     times = {name: float(np.median([timed(exact[name])[1] for _ in range(repeats + 1)])) for name in DIRECTIONS}
     return {"knob": "exact", "label": "exact"} | times | differences(outputs(exact), truth)
 
@@ -261,7 +257,6 @@ def measure(scene: Scene, start: Callable[[], Any], setting: Setting, repeats: i
 
 
 def knobs_table(result: dict[str, Any]) -> str:
-    """Markdown."""
     rows = []
     for row in result["settings"]:
         label = f"**{row['label']}**" if row["knob"] == "preset" else row["label"]

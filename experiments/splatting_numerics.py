@@ -136,7 +136,6 @@ def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int 
 
 
 def changed(scene: Scene, **arrays: np.ndarray) -> Scene:
-    """The scene with other arrays of Gaussians, in float32."""
     gaussians = scene.gaussians._replace(**{name: np.asarray(a, np.float32) for name, a in arrays.items()})
     return dataclasses.replace(scene, gaussians=gaussians)
 
@@ -153,12 +152,10 @@ def stretched(long: float, middle: float, short: float) -> Scene:
 
 
 def opaque(opacity: float) -> Scene:
-    """Every opacity the same."""
     return changed(ordinary(), opacities=np.full(COUNT, opacity))
 
 
 def turned(norm: float) -> Scene:
-    """Quaternions of one norm."""
     quats = ordinary().gaussians.quats.astype(np.float64)
     return changed(ordinary(), quats=norm * quats / np.linalg.norm(quats, axis=1, keepdims=True))
 
@@ -232,7 +229,6 @@ def over_everything(count: int = COUNT) -> Scene:
 
 
 def behind() -> Scene:
-    """Nothing before the camera."""
     means = ordinary().gaussians.means
     return changed(ordinary(), means=means * np.array([1, 1, -1]))
 
@@ -245,13 +241,11 @@ def coincident(reverse: bool = False) -> Scene:
 
 
 def narrow(dtype: type) -> Scene:
-    """Gaussians in another dtype; the camera stays float32."""
     scene = ordinary()
     return dataclasses.replace(scene, gaussians=jax.tree.map(lambda a: np.asarray(a, dtype), scene.gaussians))
 
 
 def narrow_everything(dtype: type) -> Scene:
-    """Gaussians, camera and background in another dtype."""
     scene = narrow(dtype)
     return dataclasses.replace(scene, **{k: np.asarray(getattr(scene, k), dtype) for k in ("K", "pose", "background")})
 
@@ -359,7 +353,6 @@ def tiled_in_float64(scene: Scene):
 
 
 def reference_in_float64(scene: Scene):
-    """(rendering, gradients) of the reference."""
     return _in_float64(render_reference, scene)
 
 

@@ -119,7 +119,6 @@ class Start(NamedTuple):
         return list(run.rows(cases, self.settings | dict(settings or {}), again).values())
 
     def about(self) -> str:
-        """What was measured, in one line."""
         s = self.settings
         return (
             f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels, white; {s['held_out']} "
@@ -135,13 +134,11 @@ def shipped_person(longest_edge: float | None = None) -> Avatar:
 
 
 def shipped_digest(asset: str) -> str:
-    """SHA-256 of a file of the package."""
     with resources.as_file(resources.files("humangs_jax").joinpath(asset)) as path:
         return file_digest(path)
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -104,7 +104,6 @@ def tradeoff(
 
 
 def settings_of() -> dict[str, Any]:
-    """What all points depend on."""
     net = NET if installed_lpips() else None
     return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, "lpips_net": net, **SHOTS}
 
@@ -226,7 +225,6 @@ class Bench:
 
     @staticmethod
     def how(point, avatar):
-        """How the point draws."""
         return splatting_of(point.settings.shot(Shot()), avatar)
 
     # Times and memory ------------------------------------------------------------------------------------------------

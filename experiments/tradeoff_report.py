@@ -28,7 +28,6 @@ class Point:
 
 
 def point(name: str, knob: str, size: int = SIZE, start: str = "network", **changes: Any) -> Point:
-    """A point by what differs from the default one."""
     fields = {field.name for field in dataclasses.fields(Runtime)}
     runtime = Runtime(**{key: value for key, value in changes.items() if key in fields})
     rest: dict[str, Any] = {"views": 4} | {key: value for key, value in changes.items() if key not in fields}
@@ -40,7 +39,6 @@ DEFAULT = point("default", "default")
 
 
 def points() -> list[Point]:
-    """All of them, the default first."""
     found = [DEFAULT]
     found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
@@ -109,7 +107,6 @@ SHORT = {
 
 
 def combined(**fields: Any) -> Point:
-    """A point named by its settings."""
     return point(", ".join(SHORT[key].format(value) for key, value in fields.items()), "combined", **fields)
 
 
@@ -164,7 +161,6 @@ def quality(row: Row) -> float:
 
 
 def kind(row: Row) -> str:
-    """Of `KINDS`."""
     if row["start"] in NAIVE:
         return "no network"
     return "refined" if row["settings"]["refine_steps"] or row["settings"]["refine_iterations"] else "feed-forward"
@@ -214,7 +210,6 @@ def _count(people):
 
 
 def about(result: dict[str, Any]) -> str:
-    """Of which weights, people and machine the numbers are."""
     default = result["points"]["default"]
     people, took = _count(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
     return (
@@ -225,7 +220,6 @@ def about(result: dict[str, Any]) -> str:
 
 
 def numbers(row: Row) -> list[str]:
-    """Times, memory and size."""
     share = lambda key: significant(row[key]) if row.get(key) is not None else ""
     return [share("reconstruct"), share("frame")] + [
         f"{row[key]:,.{digits}f}" if row.get(key) is not None else ""
@@ -234,7 +228,6 @@ def numbers(row: Row) -> list[str]:
 
 
 def scores(row: Row) -> list[str]:
-    """Of both tasks."""
     if row["novel"] is None:
         return [""] * (len(TASKS) * len(SCORES))
     values = [(row[task].get(key), digits) for task in TASKS for key, (_, digits) in SCORES.items()]

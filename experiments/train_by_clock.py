@@ -166,5 +166,4 @@ def stepper(config: TrainConfig) -> Any:
 
 
 def state_variables(average: Any, state: Any) -> Any:
-    """Averaged variables of a state."""
     return {"params": average, "batch_stats": state.batch_stats}

@@ -174,7 +174,6 @@ class Sample:
 
 
 def read_sample(folder: Path) -> Sample:
-    """What `make_samples` wrote."""
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     cameras = Camera(jnp.asarray(arrays["K"]), jnp.asarray(arrays["cam_from_world"]), *images.shape[1:3])

@@ -48,13 +48,10 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
 
 
 def with_model(config: Any, **runtime: Any) -> Any:
-    """With other fields of the network's `Runtime`."""
     return dataclasses.replace(config, model=config.model.with_runtime(**runtime))
 
 
 def random_weights(key: Any, slices: Any) -> Any:
-    """Random weights of a network of `losses.perceptual`."""
-
     def draw(layer, key):
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
         scale = (2 / (layer.size**2 * layer.inputs)) ** 0.5
@@ -129,7 +126,6 @@ class Case:
         return program, time.process_time() - start, costs_of(traced)
 
     def run(self, program: Any) -> None:
-        """One step."""
         self.state, metrics = program(self.state, self.batch, self.body, self.networks, seed_numbers(self.config.seed))
         self.metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
 
@@ -159,7 +155,6 @@ def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: in
 
 
 def step_numbers(name: str, repeats: int) -> dict[str, Any]:
-    """Of the whole step."""
     jax.config.update("jax_enable_compilation_cache", False)
     with tempfile.TemporaryDirectory() as folder:
         case = Case(*CASES[name]).prepare(Path(folder))
@@ -242,7 +237,6 @@ def training_cost(
 
 
 def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
-    """Of one step of a chip."""
     body = gaussian_body(load_body(), config.model)
     shapes = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
     state, networks = jax.eval_shape(lambda: init_state(config)), jax.eval_shape(lambda: random_networks(config))
@@ -289,7 +283,6 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
 
 
 def as_variant(config: Any, variant: str) -> Any:
-    """The settings of a stage with one of `VARIANTS`."""
     fields: dict[str, Any] = dict(VARIANTS[variant])
     side = config.model.conventions.image_size // config.model.architecture.encoder.patch_size
     tokens = config.views.input_counts[0] * side**2

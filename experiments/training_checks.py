@@ -78,7 +78,6 @@ def training_extremes(run: Run, only: tuple[str, ...] = (), steps: int = STEPS) 
 
 
 def base_config() -> Any:
-    """The preset `tiny`, for photos of `SIZE` pixels."""
     config = settings("tiny", SIZE, 2, 2)
     model = config.model.with_conventions(body_vertices=CARRIERS).with_runtime(token_capacity=0)
     loss = dataclasses.replace(config.loss, structural_scales=2)
@@ -87,7 +86,6 @@ def base_config() -> Any:
 
 
 def written_people(folder: Path, body: Any) -> list[Path]:
-    """Capture folders."""
     folders = [folder / f"person{seed}" for seed in range(PEOPLE)]
     for seed, path in enumerate(folders):
         write_person(path, seed, body, Layout(SIZE, views=6))
@@ -235,7 +233,6 @@ def loss_gradients(run: Run, quick: bool = False) -> None:
 
 
 def term_names() -> list[str]:
-    """All terms of `LossConfig`."""
     settings = ("structural_scales", "random_background")
     return [field.name for field in dataclasses.fields(LossConfig) if field.name not in settings]
 

@@ -106,7 +106,6 @@ def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.n
 
 
 def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
-    """One frame by other cameras."""
     shots = {
         "--azimuth 180": Shot(size=240, azimuth=180.0),
         "--elevation 60": Shot(size=240, azimuth=20.0, elevation=60.0),
@@ -124,7 +123,6 @@ def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
 
 
 def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
-    """T-pose and A-pose before several backgrounds."""
     drawn = []
     for name, pose in (("T-pose", rest_pose_of(avatar)), ("--pose a", a_pose_of(avatar))):
         for color in ("white", "#24425c", "transparent"):

@@ -91,7 +91,6 @@ def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def draw_figures(out: Path, points: np.ndarray) -> None:
-    """docs/images/your_photos_*.jpg."""
     read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
     photos, masks = (np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks"))
     marked = np.stack([with_points(photo, own) for photo, own in zip(photos, points, strict=True)])
@@ -105,7 +104,6 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
 
 
 def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """A photo with a dot for each keypoint."""
     image = Image.fromarray((255 * photo).round().astype(np.uint8))
     pen = ImageDraw.Draw(image)
     for x, y in points[np.isfinite(points).all(-1)]:
@@ -114,7 +112,6 @@ def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def save(image: np.ndarray, path: Path) -> None:
-    """A JPEG of at most `WIDTH` pixels."""
     picture = Image.fromarray((255 * np.clip(image[..., :3], 0, 1)).round().astype(np.uint8))
     picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
     picture.save(path, quality=88)

@@ -203,7 +203,6 @@ def operations(config: TrainConfig, source: Any, networks: Any) -> int:
 
 
 def network(variables: Any, model: HumanGSConfig) -> Method:
-    """What a network shows of a case."""
     return lambda case, background: shown((variables, model), case, background)[0]
 
 
@@ -236,7 +235,6 @@ class Difference(NamedTuple):
     people: int
 
     def text(self, digits: int = 2) -> str:
-        """With its interval, if there is one."""
         return f"{self.mean:+.{digits}f}" + ("" if self.half is None else f" +-{self.half:.{digits}f}")
 
     __str__ = text
@@ -323,7 +321,6 @@ def folder_of(name: str) -> str:
 
 
 def last_weights(run: Path) -> Path:
-    """Of the last round in the folder of a run."""
     return max(run.glob("*/weights.safetensors"), key=lambda path: int(path.parent.name))
 
 

@@ -125,7 +125,6 @@ def additions() -> dict[str, Pair]:
 
 
 def claims() -> list[Claim]:
-    """Those that runs decide."""
     ours = lambda count=PHOTOS: (REFERENCE, count)
     near = lambda name: tuple(Pair((REFERENCE, test), (name, test)) for test in NEAR)
     part = lambda name, tests=(PHOTOS,), score="psnr": tuple(Pair(ours(test), (name, test), score=score) for test in tests)
@@ -198,7 +197,6 @@ def claims() -> list[Claim]:
 
 
 def of_cost(cost: Mapping[str, Any]) -> list[Claim]:
-    """What it costs."""
     readers = [(row["cross-attention"], row["back-projection"]) for row in cost["rows"]]
     times = [dear["cpu_ms"] / cheap["cpu_ms"] for dear, cheap in readers]
     counts = [dear["operations"] / cheap["operations"] for dear, cheap in readers]
@@ -224,7 +222,6 @@ def of_cost(cost: Mapping[str, Any]) -> list[Claim]:
 
 
 def pair_of(a: Any, b: Any) -> str:
-    """Two printed rows' PSNR."""
     return f"{a[0]:.2f} against {b[0]:.2f} dB"
 
 

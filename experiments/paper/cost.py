@@ -92,7 +92,6 @@ def plot(path: Path, result: dict[str, Any]) -> None:
 
 
 def all_networks() -> dict[str, dict[str, float]]:
-    """Operations by name."""
     whole = {name: network_flops(name, photos) for name, photos in NETWORKS.items()}
     return whole | {name: joint_flops(name, photos) for name, photos in JOINT.items()}
 
@@ -184,7 +183,6 @@ def counted(photos: int, vertices: int, forward: Any, variables: Any, *given: An
 
 
 def text_of(result: dict[str, Any]) -> str:
-    """The rows, and the networks, as text."""
     a, b = READERS
     header = ["views", "vertices", "photo", f"{a}, CPU ms", f"{b}, CPU ms", "ratio", f"{a}, M operations"]
     header += [f"{b}, M operations", "ratio", f"{a}, MiB", f"{b}, MiB"]

@@ -93,7 +93,6 @@ def _views(rng: np.random.Generator, posed: list[PosedSubject], count: int, size
 
 
 def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
-    """Cameras moved towards a point of the world."""
     pose = np.array(cameras.cam_from_world)
     at = pose[:, :3, :3] @ middle + pose[:, :3, 3]
     pose[:, :3, 3] -= (1 - NEARER) * at
@@ -104,7 +103,6 @@ class OnePose(CaptureFolder):
     """A capture of which only the views of the first pose are used, for systems that show no other."""
 
     def summary(self) -> StoredSubject:
-        """See `StoredPerson`."""
         found = super().summary()
         first = found.frames == found.frames[0]
         return found._replace(**{name: getattr(found, name)[first] for name in ("K", "cam_from_world", "frames", "azimuths")})
@@ -118,26 +116,22 @@ class Recolored:
 
     @property
     def input_counts(self) -> tuple[int, ...]:
-        """See `Source`."""
         return self.source.input_counts
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """See `Source`."""
         return self.source.broken
 
     def __len__(self) -> int:
         return len(self.source)
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """See `Source`."""
         order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
         found = self.source.example(seed, index, input_count)
         change = lambda views: replace(views, images=views.images[..., order])
         return replace(found, inputs=change(found.inputs), targets=change(found.targets))
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """See `Source`."""
         return self.source.describe(seed, index, input_count)
 
 

@@ -170,7 +170,6 @@ def measured(
 
 
 def pose_of(capture: Any, frame: int) -> bytes:
-    """A pose as a key."""
     return b"".join(np.asarray(x, np.float32).round(5).tobytes() for x in jax.tree.leaves(capture.pose(frame)))
 
 

@@ -43,7 +43,6 @@ class NoReader(Reader):
     """The reader of systems whose decoders read the inputs themselves: its features are the encoding."""
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Encoding:
-        """The encoding."""
         return encoding
 
 
@@ -59,12 +58,10 @@ class PhotoDecoder(Decoder):
     """No Gaussians: the photos, for a `QueryDriver`."""
 
     def __call__(self, features: PyTree, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
-        """See `parts.Decoder`."""
         return HumanGSOutputs(no_gaussians(), scene=Photos(encoder_pixels(inputs, run), inputs.view_count))
 
 
 def no_gaussians() -> Gaussians:
-    """Of systems that make no canonical ones."""
     return Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
 
 

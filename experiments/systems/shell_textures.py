@@ -53,7 +53,6 @@ class PlainPhotos(Encoder):
     patch_size: Patch = 1
 
     def __call__(self, inputs: HumanGSInputs, run: Pass) -> Encoding:
-        """See `parts.Encoder`."""
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32))
 
 

@@ -130,7 +130,6 @@ class NearestPairDriver(Driver):
 
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
-        """See `parts.Driver`."""
         posed = jax.vmap(lambda center: nearest_pair(outputs.scene, center))(targets.cameras.center)
         return draw_posed(posed, targets, backgrounds, config)._replace(opacities=posed.opacities.reshape(-1))
 

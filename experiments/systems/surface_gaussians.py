@@ -188,7 +188,6 @@ class PoseMapDriver(GaussianDriver):
 
     @nn.compact
     def __call__(self, outputs: HumanGSOutputs, target: Target, run: Pass) -> HumanGSOutputs:
-        """See `parts.Driver`."""
         surface: Surface = outputs.scene
         upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])
         middle = jnp.mean(target.vertices, axis=0)

@@ -33,7 +33,6 @@ class SurfaceMap:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width."""
         return self.size, self.size * (2 if self.kind == "front_back" else 1)
 
     def texels(self, body: BodyModel) -> Texels:

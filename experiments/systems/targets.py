@@ -52,8 +52,6 @@ class GaussianDriver(Driver):
 
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
-        """See `parts.Driver`."""
-
         def one(pose):
             posed, driven = self.posed(variables, outputs, body, targets.betas, BodyPose(*pose), config.model)
             return posed, driven.tight_offsets
@@ -96,7 +94,6 @@ class PixelDriver(Driver):
 
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
-        """See `parts.Driver`; alpha 1 and depth 0 everywhere."""
         images = self.images(variables, outputs, body, targets, config.model)
         full = lambda rgb: Rendering(rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32))
         return Drawn(jax.vmap(full)(images))
@@ -151,7 +148,6 @@ def _poses(targets: Capture) -> Any:
 
 
 def _one_view(views: SubjectViews, pose: BodyPose, camera: Camera) -> SubjectViews:
-    """A target without a photo."""
     blank = jnp.zeros((1, camera.height, camera.width, 3))
     camera, rotations, translations = jax.tree.map(lambda x: x[None], (camera, pose.rotations, pose.translation))
     return SubjectViews(blank, blank[..., 0], camera, rotations, translations, views.betas)

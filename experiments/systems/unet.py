@@ -72,7 +72,6 @@ class UNet(nn.Module):
 
 
 def halved(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:
-    """Means of squares of 2 x 2."""
     views, height, width, channels = x.shape
     return jnp.mean(x.reshape(views, height // 2, 2, width // 2, 2, channels), axis=(2, 4))
 
