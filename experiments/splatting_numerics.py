@@ -27,7 +27,7 @@ from humangs_jax.rendering.splat_config import ALPHA_MIN, NEAR
 from humangs_jax.rendering.splatting import render
 
 WIDTH, HEIGHT, COUNT = 24, 16, 32
-FOCAL = 24.0
+FOCAL, UNTURNED = 24.0, np.eye(4, dtype=np.float32)
 
 IMAGE, GRADIENT = 1e-5, 1e-4
 """Bounds of a case that is nothing special to float32: largest error of a color or of alpha, and the largest relative
@@ -171,7 +171,7 @@ def at_depth(z: float, size: float, offset: float = 0.0) -> Scene:
     slopes = scene.gaussians.means[:, :2] / scene.gaussians.means[:, 2:]
     means = np.concatenate([slopes * np.abs(depth[:, None]), depth[:, None]], axis=1)
     scales = scene.gaussians.scales / 0.1 * size * abs(z) / FOCAL
-    return dataclasses.replace(changed(scene, means=means, scales=scales), pose=np.eye(4, dtype=np.float32))
+    return dataclasses.replace(changed(scene, means=means, scales=scales), pose=UNTURNED)
 
 
 def across_near_plane() -> Scene:
@@ -179,7 +179,7 @@ def across_near_plane() -> Scene:
     z = NEAR + np.linspace(-0.03, 0.08, COUNT)
     means = np.concatenate([ordinary().gaussians.means[:, :2] * 0.02, z[:, None]], axis=1)
     scene = changed(ordinary(), means=means, scales=0.2 * ordinary().gaussians.scales)
-    return dataclasses.replace(scene, pose=np.eye(4, dtype=np.float32))
+    return dataclasses.replace(scene, pose=UNTURNED)
 
 
 def seen_through(focal: float, zoomed: bool) -> Scene:
@@ -217,7 +217,7 @@ def crowd(count: int, opacity: tuple[float, float], spread: float) -> Scene:
     means = np.concatenate([slopes * z[:, None], z[:, None]], axis=1)
     scales = np.exp(rng.uniform(np.log(0.001), np.log(0.02), (count, 3)))
     scene = changed(scene, means=means, scales=scales, opacities=rng.uniform(*opacity, count))
-    return dataclasses.replace(scene, pose=np.eye(4, dtype=np.float32))
+    return dataclasses.replace(scene, pose=UNTURNED)
 
 
 def over_everything(count: int = COUNT) -> Scene:
@@ -240,14 +240,15 @@ def coincident(reverse: bool = False) -> Scene:
     return dataclasses.replace(scene, gaussians=jax.tree.map(lambda a: a[order], scene.gaussians))
 
 
-def narrow(dtype: type) -> Scene:
+def narrow(dtype: type, *others: str) -> Scene:
+    """Gaussians, and other arrays of the scene, in another dtype."""
     scene = ordinary()
-    return dataclasses.replace(scene, gaussians=jax.tree.map(lambda a: np.asarray(a, dtype), scene.gaussians))
+    cast = lambda name: jax.tree.map(lambda a: np.asarray(a, dtype), getattr(scene, name))
+    return dataclasses.replace(scene, **{name: cast(name) for name in ("gaussians", *others)})
 
 
 def narrow_everything(dtype: type) -> Scene:
-    scene = narrow(dtype)
-    return dataclasses.replace(scene, **{k: np.asarray(getattr(scene, k), dtype) for k in ("K", "pose", "background")})
+    return narrow(dtype, "K", "pose", "background")
 
 
 def anything(seed: int, focal: float, nearest: float, farthest: float, smallest: float, largest: float) -> Scene:
@@ -270,7 +271,7 @@ def anything(seed: int, focal: float, nearest: float, farthest: float, smallest:
         quats=rng.normal(size=(COUNT, 4)) * 10 ** rng.uniform(-20, 15, (COUNT, 1)),
         opacities=opacities,
     )
-    return dataclasses.replace(scene, K=K, pose=np.eye(4, dtype=np.float32), unit=float(np.median(z)))
+    return dataclasses.replace(scene, K=K, pose=UNTURNED, unit=float(np.median(z)))
 
 
 def _cases() -> list[Case]:
@@ -342,24 +343,19 @@ def evaluate(draw, gaussians, K, pose, background, unit, width, height):
     return rendering, gradients
 
 
-def tiled(scene: Scene):
-    """(rendering, gradients) of the renderer, from the scene's own dtypes."""
-    return jax.tree.map(np.asarray, evaluate(render, *scene.arguments(), scene.unit, width=scene.width, height=scene.height))
+def tiled(scene: Scene, draw: Callable = render, dtype: type | None = None):
+    """(rendering, gradients) of a renderer, from the scene's own dtypes or in another one."""
+    out = evaluate(draw, *scene.arguments(dtype), scene.unit, width=scene.width, height=scene.height)
+    return jax.tree.map(np.asarray, out)
 
 
-def tiled_in_float64(scene: Scene):
+def tiled_in_float64(scene: Scene, draw: Callable = render):
     """The same from the same numbers in float64."""
-    return _in_float64(render, scene)
-
-
-def reference_in_float64(scene: Scene):
-    return _in_float64(render_reference, scene)
-
-
-def _in_float64(draw, scene):
     with jax.enable_x64(True):
-        out = evaluate(draw, *scene.arguments(np.float64), scene.unit, width=scene.width, height=scene.height)
-        return jax.tree.map(np.asarray, out)
+        return tiled(scene, draw, np.float64)
+
+
+reference_in_float64 = functools.partial(tiled_in_float64, draw=render_reference)
 
 
 def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:

@@ -24,10 +24,8 @@ from experiments.harness import Run, entry
 from experiments.results import write_json
 from experiments.subjects import (
     TASKS,
-    EvaluationSubject,
     HeldOut,
     make_evaluation_subject,
-    ring_positions,
     score_tasks,
     shipped_digest,
 )
@@ -41,7 +39,6 @@ from humangs_jax.core.configuration import config_to_json
 from humangs_jax.core.processes import peak_memory
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.io.images import resized
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
@@ -65,7 +62,6 @@ def tradeoff(
     run: Run,
     out: Path,
     subjects: int = 2,
-    people: Path | None = None,
     only: tuple[str, ...] = (),
     image: Path | None = None,
     front: bool = False,
@@ -77,7 +73,6 @@ def tradeoff(
     Options:
     out: JSON of the points; those that are there are not measured again
     subjects: how many people
-    people: folder where rendered people are kept for later runs
     only: knobs to measure
     image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
     front: write humangs_jax/assets/front.json, where `humangs tune` finds it
@@ -92,7 +87,7 @@ def tradeoff(
             rows[each.name] = {"what": described(each), "people": []}
     missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
     if missing:
-        bench = Bench(subjects, people)
+        bench = Bench(subjects)
         # all of one person, then the next: times are of the first
         for done, (i, each) in enumerate(bar(missing, desc="points", unit="point")):
             if done % 20 == 19:
@@ -111,28 +106,8 @@ def settings_of() -> dict[str, Any]:
 def described(point) -> dict[str, Any]:
     """A point as data; what it says of weights decides whether an earlier measurement still counts."""
     learned = {"refiner": shipped_digest(SHIPPED_REFINER)} if point.settings.refine_iterations else {}
-    return learned | {
-        "knob": point.knob,
-        "size": point.size,
-        "start": point.start,
-        "settings": json.loads(config_to_json(point.settings)),
-    }
-
-
-def person_of(seed: int, body, folder: Path | None):
-    """A person with photos and held-out views; rendered once where there is a folder to keep them in."""
-    place = folder / str(seed) if folder else None
-    if place is None or not (place / "held_out" / "capture.json").exists():
-        held_out = HeldOut(SHOTS["held_out"], SHOTS["poses"], SHOTS["pose_views"])
-        person = make_evaluation_subject(seed, body, PHOTOS, TRUE_SIZE, held_out)
-        if place is None:
-            return person
-        place.mkdir(parents=True, exist_ok=True)
-        for name in ("photos", "held_out"):
-            save_capture(place / name, getattr(person, name))
-    photos, held_out = (load_capture(place / name, body=body) for name in ("photos", "held_out"))
-    positions = tuple(sorted({position for count in PHOTOS for position in ring_positions(count)}))
-    return EvaluationSubject(seed, photos, positions, held_out)
+    fields = {name: getattr(point, name) for name in ("knob", "size", "start")}
+    return learned | fields | {"settings": json.loads(config_to_json(point.settings))}
 
 
 def random_start(avatar: Any, seed: int) -> Any:
@@ -154,11 +129,10 @@ def random_start(avatar: Any, seed: int) -> Any:
 class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
-    def __init__(self, subjects: int, people: Path | None):
-        self.subjects, (self.variables, self.config) = subjects, load_weights()
-        body = load_body()
-        seeds = seeds_of("tradeoff", 0, subjects)
-        self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
+    def __init__(self, subjects: int):
+        (self.variables, self.config), body, seeds = load_weights(), load_body(), seeds_of("tradeoff", 0, subjects)
+        held_out = HeldOut(SHOTS["held_out"], SHOTS["poses"], SHOTS["pose_views"])
+        self.person = functools.cache(lambda i: make_evaluation_subject(seeds[i], body, PHOTOS, TRUE_SIZE, held_out))
         self.default = DEFAULT
         self.lpips = load_lpips(NET) if installed_lpips() else None
         self.kept: dict[Any, Any] = {}

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
-from experiments.training import random_networks, settings, written_subject
+from experiments.training import ChangedSource, random_networks, settings, written_subject
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
@@ -99,8 +99,7 @@ def runs() -> dict[str, tuple[Any, Any, Any]]:
         """All weights of the loss times a factor."""
 
         def change(config):
-            names = [f.name for f in dataclasses.fields(LossConfig) if f.type is float and f.name != "random_background"]
-            weights = {name: factor * getattr(config.loss, name) for name in names}
+            weights = {name: factor * getattr(config.loss, name) for name in term_names()}
             return dataclasses.replace(config, loss=dataclasses.replace(config.loss, **weights))
 
         return change
@@ -136,29 +135,12 @@ def whitened(inputs: slice, targets: slice) -> Any:
         images[which] = 1.0
         return replace(views, images=images)
 
-    return lambda example: replace(example, inputs=white(example.inputs, inputs), targets=white(example.targets, targets))
+    return lambda example, *_: replace(example, inputs=white(example.inputs, inputs), targets=white(example.targets, targets))
 
 
-def changed(change: Any = lambda example: example, index: Any = lambda i: i) -> Any:
-    """(folders, body) -> source of changed examples; index: number of an example -> number of the one in its place."""
-
-    class Changed:
-        def __init__(self, source):
-            self._source = source
-
-        def __getattr__(self, name):
-            return getattr(self._source, name)
-
-        def __len__(self):
-            return len(self._source)
-
-        def example(self, seed, i, input_count):
-            return change(self._source.example(seed, index(i), input_count))
-
-        def describe(self, seed, i, input_count):
-            return self._source.describe(seed, index(i), input_count)
-
-    return lambda folders, body: lambda config: Changed(captured_people(folders, body)(config))
+def changed(*how: Any, **named: Any) -> Any:
+    """(folders, body) -> source of changed examples."""
+    return lambda folders, body: lambda config: ChangedSource(captured_people(folders, body)(config), *how, **named)
 
 
 def outcome(
@@ -167,8 +149,11 @@ def outcome(
     """What becomes of one run. start None: parameters of another type are handed to the training step itself."""
     try:
         config = change(base)
-        if start is None:
-            step_with_bfloat16(config, variables, make_source, body)
+        if start is None:  # one step of a state whose parameters somebody has made bfloat16
+            state = init_state(config, variables)
+            state = replace(state, params=jax.tree.map(lambda x: x.astype(jnp.bfloat16), state.params))
+            batch = Loader(make_source(config), config.batch_size).batch_at(0)
+            train_step(state, batch, gaussian_body(body, config.model), config)
             return {"error": None}
         state = train(config, body, make_source, out, variables=start(variables), stop_at=stop_at, progress=False)
     except ValueError as error:
@@ -191,14 +176,6 @@ def outcome(
         "steps": len(steps),
         "events": dict(events),
     }
-
-
-def step_with_bfloat16(config: Any, variables: Any, make_source: Any, body: Any) -> None:
-    """One training step of a state whose parameters somebody has made bfloat16."""
-    state = init_state(config, variables)
-    state = replace(state, params=jax.tree.map(lambda x: x.astype(jnp.bfloat16), state.params))
-    batch = Loader(make_source(config), config.batch_size).batch_at(0)
-    train_step(state, batch, gaussian_body(body, config.model), config)
 
 
 DIRECTIONS = 3

@@ -4,19 +4,18 @@ Bodies, skin, dyes and cameras differ. Each person is seen in two of the poses.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.training import ChangedSource
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
-from humangs_jax.data.loading import CaptureSource, Example, PeopleCache
+from humangs_jax.data.loading import Example, PeopleCache
 from humangs_jax.data.loading.captures import CaptureFolder, find_captures
 from humangs_jax.data.loading.examples import StoredSubject
 from humangs_jax.geometry.camera import Camera
@@ -108,35 +107,15 @@ class OnePose(CaptureFolder):
         return found._replace(**{name: getattr(found, name)[first] for name in ("K", "cam_from_world", "frames", "azimuths")})
 
 
-@dataclasses.dataclass(frozen=True)
-class Recolored:
-    """A `Source` whose examples have their color channels exchanged, the same way in all images of one: six times the dyes."""
-
-    source: CaptureSource
-
-    @property
-    def input_counts(self) -> tuple[int, ...]:
-        return self.source.input_counts
-
-    @property
-    def broken(self) -> Mapping[str, str]:
-        return self.source.broken
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def example(self, seed: int, index: int, input_count: int) -> Example:
-        order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
-        found = self.source.example(seed, index, input_count)
-        change = lambda views: replace(views, images=views.images[..., order])
-        return replace(found, inputs=change(found.inputs), targets=change(found.targets))
-
-    def describe(self, seed: int, index: int, input_count: int) -> str:
-        return self.source.describe(seed, index, input_count)
+def recolored_example(example: Example, seed: int, index: int) -> Example:
+    """Its color channels exchanged, the same way in all images: six times the dyes."""
+    order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
+    change = lambda views: replace(views, images=views.images[..., order])
+    return replace(example, inputs=change(example.inputs), targets=change(example.targets))
 
 
 def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> MakeSource:
     """The people of a folder as a run's source. one_pose: of the first pose alone."""
     body, kind = load_body(), OnePose if one_pose else CaptureFolder
     make = cached_people(PeopleCache([kind(path, body) for path in find_captures(folder)]))
-    return (lambda config: Recolored(cast(CaptureSource, make(config)))) if recolored else make
+    return (lambda config: ChangedSource(make(config), recolored_example)) if recolored else make
