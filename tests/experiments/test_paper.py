@@ -148,27 +148,6 @@ def test_the_page_of_the_paper_says_what_the_results_say():
     assert places == sorted(places) and len(places) == len(rows)  # contradictions first
 
 
-def test_the_table_marks_what_is_not_trained(report):
-    first = train_all.table(report).split("\n\n")[0]
-    lines = {cells[0].strip(): cells for line in first.splitlines() if (cells := line.strip("| ").split("|"))}
-    assert "not trained: 40 steps, 9.90 dB in validation" in lines["lvsm"][8] and lines["lvsm"][3].strip() == "-"
-    assert "not trained" in lines["humanram"][8]  # done, but hardly better than the painted body and still rising
-    assert lines["giga"][8].strip().startswith("+1.0") and [lines["ghg"][i].strip() for i in (1, 2)] == ["4", "3"]
-    assert bench.trained_names(report) == ["paper", "ghg", "giga", "lhm"]
-    report["runs"]["no global token"] = seeded(14.5, counts=(1, 2, 6))
-    found = train_all.ablations(report)
-    assert list(found) == ["The global token", "Photos, over the number before"]  # of the others nothing is trained
-    gains = {tuple(line[:3]): line[3:] for line in found["The global token"][1]}
-    assert (
-        gains["standard", "another pose", "PSNR, dB"][0].startswith("+0.5") and ("near", "another pose", "PSNR, dB") not in gains
-    )
-    photos = {tuple(line[:3]): line[3:] for line in found["Photos, over the number before"][1]}
-    assert (
-        photos["near", "pose of the photos", "PSNR, dB"][0] == "-" and "+-" in photos["near", "another pose", "LPIPS (Alex)"][3]
-    )
-    assert train_all.table(report).count("a gain is positive") == 2
-
-
 def test_runs_of_other_settings_are_not_mixed(tmp_path):
     path = tmp_path / "results.json"
     assert train_all.kept(path, {"people": 1})["runs"] == {}
@@ -240,25 +219,6 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
     assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["domains"]
     assert "| mine | 4 photos | 25.00 / 0.900 / - | 31.00 / 0.900 / - | 28.00 / 0.900 / - |" in texts["gaussians"]
-
-
-def test_a_cost_table_has_the_ratio_of_the_readers():
-    readers = {
-        "back-projection": {"cpu_ms": 2.0, "operations": 1e7, "temporary_mb": 1.0},
-        "cross-attention": {"cpu_ms": 30.0, "operations": 9e9, "temporary_mb": 44.0},
-    }
-    network = {"photos": 4, "vertices": 10, "parameters": 1e8, "operations": 2e12}
-    result = {
-        "rows": [{"views": 4, "vertices": 10000, "size": 256, **readers}],
-        "width": 128,
-        "networks": {"humangs": network, "lhm": network | {"operations": 8e12}},
-    }
-    text = cost.text_of(result)
-    assert "| 4 | 10000 | 256 | 2.0 | 30 | 15 | 10 | 9000 | 900 | 1.0 | 44 |" in text
-    assert (
-        "| lhm, joint attention alone | 4 | 10 | 100 | 8.00 | 4.0 |" in text
-        and "| LHM (single view), printed seconds |  |  |  | 4.6 | 16 |" in text
-    )
 
 
 @pytest.mark.slow

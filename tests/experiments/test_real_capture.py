@@ -5,7 +5,7 @@ import pytest
 
 from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
 from experiments.real_people import camera_errors, seen_from, to_reference
-from experiments.real_person import measure, section
+from experiments.real_person import measure
 from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
@@ -94,8 +94,5 @@ def test_a_run_goes_on_where_it_stopped(tmp_path):
         return {"iou": 0.75, "psnr": 19.5, "each_iou": [0.7, 0.8]}
 
     for frames in (["33"], ["33", "66"]):
-        results = measure(file, "now", (("calibrated, fit, detected", frame, scores) for frame in frames))
+        measure(file, "now", (("calibrated, fit, detected", frame, scores) for frame in frames))
     assert len(calls) == 2
-    table = section(results)
-    assert "| calibrated, fit, detected | now | 2 | 0.750 | - | 19.5 | - |" in table
-    assert "seconds" not in table

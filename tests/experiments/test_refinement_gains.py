@@ -1,12 +1,15 @@
 """Means and tables of refinement, README's tables: without rendering anybody."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.pictures import DETAIL_PIXELS, DETAILS, details, frontal_view
-from experiments.refinement import readme_quality, readme_times, refinement_means, refinement_section
+from experiments.refinement import readme_quality, readme_times, refinement_means
+from experiments.results import REPOSITORY, text_of
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import rest_pose, shape_body
 from humangs_jax.data.capture import Capture
@@ -15,26 +18,12 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_fg": 18.75, "semi_transparent": 0.1, "psnr_boundary": 15.0, "lpips": None}
 
 
-def row(*psnrs, name="256 4 0 Adam"):
-    tasks = lambda psnr: dict.fromkeys(("novel", "animation"), SCORES | {"psnr": psnr})
-    return {name: {seconds: tasks(psnr) for seconds, psnr in zip(("0", "5"), psnrs, strict=True)}}
+def test_gains_are_means_and_the_least_of_a_person():
+    def row(*psnrs):
+        return {"256": {seconds: {"novel": {"psnr": psnr}} for seconds, psnr in zip(("0", "5"), psnrs, strict=True)}}
 
-
-def test_means_gains_and_the_table():
-    means = refinement_means([row(20.0, 22.0), row(24.0, 24.5)])
-    cell = means["256 4 0 Adam"]["5"]
+    cell = refinement_means([row(20.0, 22.0), row(24.0, 24.5)])["256"]["5"]
     assert cell["novel"]["psnr"] == 23.25 and cell["least_gain"] == 0.5
-    means |= {"256 4 0 4 iterations, Adam": means["256 4 0 Adam"]}
-    table = refinement_section(means, {"split": "test", "off": [0]}, 2)
-    rows = [line for line in table.splitlines() if line.startswith("| 4 of")]
-    assert rows[0] == "| 4 of 256 px | none | 0 | 22.00 | 18.75 | 15.00 | 0.100 | 22.00 | 18.75 |  |" and len(rows) == 3
-    assert rows[2] == "| 4 of 256 px | 4 iterations, Adam | 5 | 23.25 | 18.75 | 15.00 | 0.100 | 23.25 | 18.75 | 0.50 |"
-    for task in ("novel", "animation"):
-        for cell in means["256 4 0 Adam"].values():
-            cell[task]["lpips"] = 0.05
-    table = refinement_section(means, {"split": "test", "off": [2.5], "lpips_net": "alex"}, 2)
-    assert "LPIPS alex;" in table
-    assert "| 4 of 256 px | 0 mm | Adam | 5 | 23.25 | 18.75 | 0.050 | 15.00 | 0.100 | 23.25 | 18.75 | 0.050 | 0.50 |" in table
 
 
 TIMES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
@@ -47,22 +36,14 @@ DEMO = SCORES | {
 }
 
 
-def test_readme_quality_is_of_the_same_weights():
-    settings = {"settings": {"weights": "a"}, "people": 3}
-    baseline = {"baseline_psnr": 20.67, "baseline_psnr_fg": 11.28, "baseline_lpips": 0.1444, "lpips": 0.0712}
-    people = settings | {"by_views": {"4": {"novel": SCORES | baseline}}}
-    seen = {"default": SCORES | {"alex": 0.0506}, "iterations alone": {}}
-    cells = {f"{size} 0 {task}": seen for size in (256, 512) for task in ("novel", "animation")}
-    refined = settings | {"people": 2, "means": {"all": cells}}
+def test_readme_quality_is_of_the_tables_of_the_docs_and_of_the_same_weights():
+    stored = lambda name: json.loads((REPOSITORY / "docs" / "results" / f"{name}.json").read_text())
+    people, refined = (stored(name)["numbers"] for name in ("evaluation_views", "appearance"))
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = readme_quality(demo, people, refined).splitlines()[2:]
-    assert rows[0] == "| 3 synthetic people, 256 px, feed-forward | 27.4 | 18.8 |  |" and len(rows) == 6
-    assert rows[1] == "| 2 of them, as `humangs reconstruct` makes them | 27.4 | 18.8 | 0.051 |"
+    shown = text_of(stored("readme_quality")["blocks"]).splitlines()[2:]
     assert rows[4] == "| the demo's person, 256 px, refined for 15 s | 29.2 | 18.8 |  |"
-    assert rows[5] == "| vertex-color baseline, 256 px | 20.7 | 11.3 |  |"
-    alex = people | {"settings": {"weights": "a", "lpips_net": "alex"}}
-    rows = readme_quality(demo, alex, refined).splitlines()[2:]
-    assert rows[0].endswith("| 18.8 | 0.071 |") and rows[5].endswith("| 11.3 | 0.144 |")
+    assert [*rows[:4], *rows[5:]] == [*shown[:4], *shown[5:]]
     for said, changed in {
         "expected `humangs demo` without": (DEMO, people, refined),
         "of different weights": (demo, people, refined | {"settings": {"weights": "b"}}),

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from experiments import real_person, refinement, splatting, tradeoff_report
+from experiments.paper import cost, train_all
 from experiments.render_tables import render_pages
 from experiments.results import blocks_of, json_text, publish, text_of
 from experiments.robustness import interval
@@ -34,6 +36,30 @@ def test_every_result_says_what_made_it(path):
     known = result["date"] and result["machine"]["cpu"] and result["versions"]["jax"]
     assert known or result["source"] == "transcribed from the document of version 0.1"
     assert result["blocks"] and json_text(result) + "\n" == path.read_text()
+
+
+def section_of(name, numbers):
+    """The text that the experiment behind a table makes of its numbers."""
+    if name.startswith("refinement"):
+        return refinement.refinement_section(numbers["means"], numbers["settings"], numbers["people"])
+    if name.startswith("tradeoff"):
+        result = stored("tradeoff")["numbers"]
+        table = tradeoff_report.preset_table if name == "tradeoff_presets" else tradeoff_report.point_table
+        return table(tradeoff_report.rows_of(result), result)
+    makers = {"paper": train_all.table, "paper_cost": cost.text_of, "real_person": real_person.section}
+    return (makers | {"splatting_tradeoff": splatting.knobs_table})[name](numbers)
+
+
+def stored(name):
+    return json.loads((REPOSITORY / "docs" / "results" / f"{name}.json").read_text())
+
+
+TABLES = ("refinement", "refinement_few", "refinement_off", "tradeoff", "tradeoff_presets", "splatting_tradeoff")
+
+
+@pytest.mark.parametrize("name", [*TABLES, "paper", "paper_cost", "real_person"])
+def test_a_table_is_what_its_experiment_makes_of_the_numbers(name):
+    assert section_of(name, stored(name)["numbers"]) == text_of(stored(name)["blocks"])
 
 
 @pytest.mark.parametrize(("pattern", "begins"), [("*.jpg", b"\xff\xd8\xff"), ("*.png", b"\x89PNG"), ("*.gif", b"GIF8")])
