@@ -310,14 +310,8 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
     return found
 
 
-def drawn_scores(avatar: Avatar, views: Capture, photos: RealFrame, shown: Sequence[int]) -> dict[str, float]:
-    """psnr and psnr_fg (dB), and LPIPS, of an avatar from the cameras and in the poses of these views, means over them."""
-    truth = photos.truth()[list(shown)]
-    return drawn_psnrs(avatar, dataclasses.replace(views, images=truth, masks=photos.careful[list(shown)]))
-
-
 def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
-    """The same against the photos of these views."""
+    """psnr and psnr_fg (dB), and LPIPS, of an avatar against the photos of these views, means over them."""
     return _scores(draw_views(avatar, truth).images, truth)
 
 

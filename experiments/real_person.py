@@ -20,7 +20,6 @@ from experiments.real_capture import (
     RealFrame,
     body_ious,
     drawn_psnrs,
-    drawn_scores,
     held_out,
     prepare,
 )
@@ -152,8 +151,9 @@ def poses(man: Man) -> Cases:
 
 
 def _posed(man, first, number):
-    avatar = avatar_of(man.body(first, "detected"))
-    return drawn_scores(avatar, man.body(number, "detected"), man.frames[number], ALL)
+    frame, views = man.frames[number], man.body(number, "detected")
+    truth = dataclasses.replace(views, images=frame.truth(), masks=frame.careful)
+    return drawn_psnrs(avatar_of(man.body(first, "detected")), truth)
 
 
 def uncalibrated(man: Man) -> Cases:

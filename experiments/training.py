@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.costs import Costs, costs_of, temporary_mb
+from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry, figure
 from experiments.reconstruction import foreground, matmul_program, random_variables
 from experiments.results import markdown_table
@@ -113,45 +113,6 @@ CASES = {
 """Preset, size of photos and targets, input views, targets. The last one is for tests."""
 
 
-class Case:
-    """Everything that a step of one configuration needs; `state` is what the last step gave."""
-
-    def __init__(self, preset: str, size: int, views: int, targets: int):
-        dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
-        self.config = with_model(settings(preset, size, views, targets), dtype=dtype)
-        self.networks = random_networks(self.config)
-
-    def prepare(self, folder: Path) -> "Case":
-        """Makes the person, reads the batch, draws the weights; room for the person's foreground tokens, as a run would have."""
-        config, body = self.config, load_body()
-        size = config.model.conventions.image_size
-        cache = CaptureCache([written_subject(folder, config, body)], body)
-        source = CaptureSource(cache, config.views, size, config.target_size, config.loss.depth > 0)
-        self.body = gaussian_body(body, config.model)
-        self.batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
-        if config.model.tokens == "foreground":
-            first = jax.tree.map(lambda x: x[0], self.batch)
-            inputs = jax.jit(prepare_inputs, static_argnames="config")(self.body, first.inputs, config.model)
-            room = foreground(inputs, config.model)[0].runtime.token_capacity
-            self.config = with_model(config, token_capacity=room)
-        self.state = init_state(self.config, random_variables(self.config.model))
-        return self
-
-    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Costs]:
-        """(the step as a program, CPU seconds that it took to trace and compile, its operations)."""
-        static = ("config", "mesh")
-        step = jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
-        start = time.process_time()
-        arguments = self.state, self.batch, self.body, self.networks, seed_numbers(self.config.seed)
-        traced = step.trace(*arguments, config=self.config, mesh=None)
-        program = traced.lower().compile()
-        return program, time.process_time() - start, costs_of(traced)
-
-    def run(self, program: Any) -> None:
-        self.state, metrics = program(self.state, self.batch, self.body, self.networks, seed_numbers(self.config.seed))
-        self.metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
-
-
 @entry
 def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: int = 3) -> None:
     """Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
@@ -178,15 +139,36 @@ def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: in
 
 def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     jax.config.update("jax_enable_compilation_cache", False)
+    config, body = settings(*CASES[name]), load_body()
+    config = with_model(config, dtype="float32" if jax.default_backend() == "cpu" else "bfloat16")
+    networks, carrier, size = random_networks(config), gaussian_body(body, config.model), config.model.conventions.image_size
     with tempfile.TemporaryDirectory() as folder:
-        case = Case(*CASES[name]).prepare(Path(folder))
-        program, compile_s, costs = case.compiled(compiler_options())
-        product, product_flops = matmul_program(case.config.model.runtime.dtype)
-        times = medians({"matmul": product, "step": lambda: case.run(program)}, repeats)
-    (wall, cpu), model = map(float, times["step"]), case.config.model
+        cache = CaptureCache([written_subject(Path(folder), config, body)], body)
+        source = CaptureSource(cache, config.views, size, config.target_size, config.loss.depth > 0)
+        batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
+    if config.model.tokens == "foreground":  # room for the person's foreground tokens, as a run would have
+        first = jax.tree.map(lambda x: x[0], batch)
+        inputs = jax.jit(prepare_inputs, static_argnames="config")(carrier, first.inputs, config.model)
+        config = with_model(config, token_capacity=foreground(inputs, config.model)[0].runtime.token_capacity)
+    state, given = init_state(config, random_variables(config.model)), (batch, carrier, networks, seed_numbers(config.seed))
+    static, options = ("config", "mesh"), compiler_options()
+    step = jax.jit(update, static_argnames=static, donate_argnames="state", compiler_options=options)
+    start = time.process_time()
+    traced = step.trace(state, *given, config=config, mesh=None)
+    program = traced.lower().compile()
+    compile_s, costs, metrics = time.process_time() - start, costs_of(traced), {}
+
+    def once():
+        nonlocal state
+        state, found = program(state, *given)
+        metrics.update({name: float(value) for name, value in jax.device_get(found).items()})
+
+    product, product_flops = matmul_program(config.model.runtime.dtype)
+    times = medians({"matmul": product, "step": once}, repeats)
+    (wall, cpu), model = map(float, times["step"]), config.model
     floor = costs.flops / product_flops * times["matmul"]
     side = model.conventions.image_size // model.architecture.encoder.patch_size
-    patches = case.config.views.input_counts[0] * side**2
+    patches = config.views.input_counts[0] * side**2
     return {
         "ms": wall,
         "cpu_ms": cpu,
@@ -197,8 +179,8 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb(),
         "compile_cpu_s": compile_s,
         "tokens": model.runtime.token_capacity if model.tokens == "foreground" else patches,
-        "gaussians": len(case.body.template) * model.architecture.decoder.gaussians_per_vertex,
-        "losses": case.metrics,
+        "gaussians": len(carrier.template) * model.architecture.decoder.gaussians_per_vertex,
+        "losses": metrics,
         "dtype": model.runtime.dtype,
         "device": jax.devices()[0].device_kind,
     }

@@ -9,7 +9,7 @@ data, the body and the loop of this package, and none of the pretrained networks
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 from experiments.systems.correction import CorrectionMLP
 from experiments.systems.cross_attention import CrossAttentionReader
@@ -23,8 +23,6 @@ from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
-from humangs_jax.network.parts import Driver, Reader
-from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -66,12 +64,17 @@ def _scaled(conventions: Conventions) -> Conventions:
     return dataclasses.replace(conventions, **BENCH)
 
 
+def _sized(size: Size, conventions: Conventions, *parts: Any) -> HumanGSConfig:
+    """A system of these parts, at the bench for its photos and bodies."""
+    return HumanGSConfig(Architecture(*parts), conventions if size == "published" else _scaled(conventions))
+
+
 def lvsm(size: Size = "published") -> HumanGSConfig:
     """LVSM-style (`pixel_queries`), decoder-only, 24 layers. Novel views only: it cannot be animated."""
-    parts, conventions = (PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()), Conventions(image_size=256)
-    if size == "published":
-        return HumanGSConfig(Architecture(*parts, QueryDriver()), conventions, Runtime(dtype="bfloat16"))
-    return HumanGSConfig(Architecture(*parts, QueryDriver(BENCH_BLOCKS)), _scaled(conventions))
+    parts = PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()
+    if size == "bench":
+        return _sized(size, Conventions(image_size=256), *parts, QueryDriver(BENCH_BLOCKS))
+    return _sized(size, Conventions(image_size=256), *parts, QueryDriver()).with_runtime(dtype="bfloat16")
 
 
 def lvsm_latents(size: Size = "published") -> HumanGSConfig:
@@ -94,7 +97,7 @@ def giga(size: Size = "published") -> HumanGSConfig:
     """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one Gaussian a texel."""
     driver = TextureDriver() if size == "published" else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
     surface = SurfaceMap("atlas", 512 if size == "published" else 48)
-    return _on_the_surface(size, TextureReader(surface), surface, driver)
+    return _sized(size, Conventions(pixels="person"), PlainPhotos(), TextureReader(surface), SurfaceDecoder(surface), driver)
 
 
 def animatable(size: Size = "published") -> HumanGSConfig:
@@ -103,7 +106,7 @@ def animatable(size: Size = "published") -> HumanGSConfig:
     """
     driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
     surface = SurfaceMap("front_back", 1024 if size == "published" else 96)
-    return _on_the_surface(size, NoReader(), surface, driver)
+    return _sized(size, Conventions(pixels="person"), PlainPhotos(), NoReader(), SurfaceDecoder(surface), driver)
 
 
 def lca(size: Size = "published") -> HumanGSConfig:
@@ -112,13 +115,6 @@ def lca(size: Size = "published") -> HumanGSConfig:
     """
     driver = CorrectionMLP() if size == "published" else CorrectionMLP(BENCH_WIDTH, 2)
     return lhm_views(size).with_parts(driver=driver)
-
-
-def _on_the_surface(size: Size, reader: Reader, surface: SurfaceMap, driver: Driver) -> HumanGSConfig:
-    """Systems whose Gaussians are texels: their photos and bodies are those of the others."""
-    conventions = Conventions(pixels="person")
-    parts = Architecture(PlainPhotos(), reader, SurfaceDecoder(surface), driver)
-    return HumanGSConfig(parts, conventions if size == "published" else _scaled(conventions))
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
@@ -148,7 +144,7 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
         reader, decoder = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views), VertexDecoder(hidden=BENCH_WIDTH)
     decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
     conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.0128)
-    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions if size == "published" else _scaled(conventions))
+    return _sized(size, conventions, encoder, reader, decoder)
 
 
 def lhm_views(size: Size = "published") -> HumanGSConfig:
@@ -180,17 +176,14 @@ def ghg(size: Size = "published") -> HumanGSConfig:
     reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 48))
     # texels of the bench are 4 cm wide on the innermost shell
     decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.04)
-    conventions = Conventions(pixels="person")
-    return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions if published else _scaled(conventions))
+    return _sized(size, Conventions(pixels="person"), PlainPhotos(), reader, decoder)
 
 
 def gps(size: Size = "published") -> HumanGSConfig:
     """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest of the photos. Novel views only."""
-    published = size == "published"
-    decoder = StereoDecoder() if published else StereoDecoder((16, 32, 64), planes=24)
-    conventions = Conventions(image_size=1024, pixels="person")
-    parts = Architecture(PlainPhotos(patch_size=8), NoReader(), decoder, NearestPairDriver())
-    return HumanGSConfig(parts, conventions if published else _scaled(conventions))
+    decoder = StereoDecoder() if size == "published" else StereoDecoder((16, 32, 64), planes=24)
+    parts = PlainPhotos(patch_size=8), NoReader(), decoder, NearestPairDriver()
+    return _sized(size, Conventions(image_size=1024, pixels="person"), *parts)
 
 
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
