@@ -56,9 +56,9 @@ UPRIGHT = (7, 8)
 """The feet keep their attitude, so that the soles stay flat whatever the legs do."""
 
 
-def macro(kind: str, weight: float = 1.0) -> dict[str, float]:
+def macro(kind: str) -> dict[str, float]:
     """Half of the female and half of the male target universal-<sex>-<kind>."""
-    return {f"macrodetails/universal-{sex}-{kind}": 0.5 * weight for sex in SEXES}
+    return {f"macrodetails/universal-{sex}-{kind}": 0.5 for sex in SEXES}
 
 
 def faces_of(age: str, sexes: tuple[str, ...] = SEXES) -> dict[str, float]:

@@ -25,6 +25,8 @@ from humangs_jax.people.subject import make_subject
 from humangs_jax.people.surroundings import cameras_around, spread_azimuths
 
 POSE_STREAM, CAMERA_STREAM, ERROR_STREAM = 21, 22, 23
+SIZE = 512
+"""Pixels a side of the photos."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +44,7 @@ class FitCase:
     cam_from_world: np.ndarray
 
 
-def make_case(seed, body, model, frames, views, size=512) -> FitCase:
+def make_case(seed, body, model, frames, views) -> FitCase:
     """The person of a seed in random poses, each with cameras of its own, as of the published protocol."""
     subject = make_subject(seed, body)
     rotations, translations, extrinsics, intrinsics = [], [], [], []
@@ -53,7 +55,7 @@ def make_case(seed, body, model, frames, views, size=512) -> FitCase:
         vertices = subject.posed_vertices(pose, np.zeros(3))
         shift = rng.uniform([-1, 0, -1], [1, 0, 1]) - [0, vertices[:, 1].min(), 0]
         rng = np.random.default_rng([seed, CAMERA_STREAM, frame])
-        cameras = cameras_around(rng, vertices + shift, spread_azimuths(rng, views), size)
+        cameras = cameras_around(rng, vertices + shift, spread_azimuths(rng, views), SIZE)
         rotations.append(pose)
         translations.append(shift)
         extrinsics.append(np.asarray(cameras.cam_from_world))
@@ -63,15 +65,15 @@ def make_case(seed, body, model, frames, views, size=512) -> FitCase:
     return FitCase(subject.betas, rotations, translations, joints, landmarks, np.stack(intrinsics), np.stack(extrinsics))
 
 
-def walking(model, seed, views=4, size=512) -> FitCase:
+def walking(model, seed) -> FitCase:
     """The person of a seed in the first frames of the shipped walk; cameras stand still all around."""
     motion, rng = load_motion(), np.random.default_rng([seed, POSE_STREAM])
     rotations, translations = (np.asarray(x)[:FRAMES] for x in (motion.rotations, motion.translations))
     betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
     landmarks, joints = _posed(model, betas, rotations, translations)
-    azimuths = rng.uniform(0, 2 * np.pi) + np.arange(views) * (2 * np.pi / views)
-    K, middle = intrinsics_from_fov(1.0, size, size), jnp.asarray(joints.mean((0, 1)))
-    cameras = orbit(middle, 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, size, size)
+    azimuths = rng.uniform(0, 2 * np.pi) + np.arange(4) * (2 * np.pi / 4)
+    K, middle = intrinsics_from_fov(1.0, SIZE, SIZE), jnp.asarray(joints.mean((0, 1)))
+    cameras = orbit(middle, 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, SIZE, SIZE)
     still = lambda array: np.broadcast_to(np.asarray(array), (FRAMES, *array.shape))
     return FitCase(betas, rotations, translations, joints, landmarks, still(cameras.K), still(cameras.cam_from_world))
 

@@ -220,16 +220,14 @@ def means(rows: Sequence[Row]) -> Row:
 
 
 @contextlib.contextmanager
-def figure(
-    path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0, rows: int = 1
-) -> Generator[Any]:
-    """Axes of plots in rows, written when the block ends. legend: share of the height for one legend below all."""
+def figure(path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0) -> Generator[Any]:
+    """Axes of plots side by side, written when the block ends. legend: share of the height for one legend below all."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    drawn, axes = plt.subplots(rows, columns, figsize=size, squeeze=rows == 1)
+    drawn, axes = plt.subplots(1, columns, figsize=size)
     yield axes
     for axis in drawn.axes:
         axis.grid(alpha=0.3)

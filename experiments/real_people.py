@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.real_capture import CAMERAS, DEMO, FRAMES, SIZE, RealFrame, body_ious, largest_person, prepare, read_frames
+from experiments.real_capture import CAMERAS, DEMO, SIZE, RealFrame, body_ious, largest_person, prepare, read_frames
 from experiments.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import images, motion_views, turntable_views
@@ -197,11 +197,11 @@ class Reference(NamedTuple):
         return stack_cameras([Camera.from_opencv(K, matrix, SIZE, SIZE) for K, matrix in pairs])
 
 
-def reference_cameras(folder: Path, frames: Sequence[int] = FRAMES) -> Reference:
+def reference_cameras(folder: Path) -> Reference:
     """Found once, then read from `folder`/prepared/cameras.npz."""
     file = folder / "prepared" / "cameras.npz"
     if not file.exists():
-        write_npz(file, _found(list(prepare(folder, frames).values()))._asdict())
+        write_npz(file, _found(list(prepare(folder).values()))._asdict())
     with np.load(file) as stored:
         return Reference(stored["K"], stored["cam_from_world"])
 

@@ -171,15 +171,12 @@ def compared(rows: list[Row]) -> list[Row]:
     return [row for row in rows if row["novel"] is not None and row["size"] == SIZE]
 
 
-def better(row: Row, rows: list[Row], keys: tuple[str, ...] = ("reconstruct", "frame")) -> list[Row]:
-    """The points that are better and take no longer."""
-    return [r for r in rows if quality(r) > quality(row) and all(r[key] <= EQUAL * row[key] for key in keys)]
-
-
-def front_of(rows: list[Row], keys: tuple[str, ...] = ("reconstruct", "frame")) -> list[Row]:
-    """The points of ours that no other one dominates, cheapest reconstruction first."""
+def front_of(rows: list[Row]) -> list[Row]:
+    """The points of ours than which no other one is better and takes no longer, cheapest reconstruction first."""
     ours = [row for row in compared(rows) if row["start"] == "network"]
-    return sorted((row for row in ours if not better(row, ours, keys)), key=lambda row: row["reconstruct"])
+    no_longer = lambda a, b: all(a[key] <= EQUAL * b[key] for key in ("reconstruct", "frame"))
+    beaten = lambda row: any(quality(other) > quality(row) and no_longer(other, row) for other in ours)
+    return sorted((row for row in ours if not beaten(row)), key=lambda row: row["reconstruct"])
 
 
 def front_file(rows: list[Row], result: dict[str, Any]) -> dict[str, Any]:

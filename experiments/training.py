@@ -73,12 +73,12 @@ def random_networks(config: Any) -> Any:
     return LossNetworks(perceptual, lpips)
 
 
-def written_subject(folder: Path, config: Any, body: Any, seed: int = 0) -> Path:
+def written_subject(folder: Path, config: Any, body: Any) -> Path:
     """The capture folder of a synthetic person with as many views as an example takes; made if it is not there."""
     views = config.views.input_counts[0] + config.views.target_count
     path = folder / f"{config.model.conventions.image_size}_{views}"
     if not path.exists():
-        write_person(path, seed, body, Layout(config.model.conventions.image_size, views=views))
+        write_person(path, 0, body, Layout(config.model.conventions.image_size, views=views))
     return path
 
 
