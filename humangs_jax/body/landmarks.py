@@ -1,26 +1,14 @@
 """Positions on a body of the landmarks that annotators and detectors mark in photos.
 
-A landmark is a weighted mean of joints, or a vertex that a rule finds on the body's own template, so that any body whose joints
-have SMPL-X's names has them. Sides are the person's. By name:
-
-    {side}_shoulder, elbow, wrist, hip, knee, ankle    the joint
-    {side}_hand_root                                   the wrist
-    {side}_FINGER_1, 2, 3                              joints FINGER1, 2, 3: knuckles from the palm outwards
-    {side}_FINGER_tip                                  vertex of the last segment farthest along it
-    neck                                               middle of the shoulders (as OpenPose has it)
-    mid_hip                                            middle of the hips
-    {side}_eye                                         the joint: centre of the eyeball, a centimetre behind the pupil
-    nose, face_30                                      foremost vertex of the head between jaw and eyes
-    face_8                                             chin: lowest vertex of the front of the head's midline
-    face_27                                            root of the nose: vertex of the midline at the height of the eyes
-    {side}_ear                                         outermost vertex of the head at the height of the ears
-    {side}_big_toe, small_toe, heel                    vertices of the foot farthest forward and inward, forward and outward, back
-    {side}_foot_index                                  foremost vertex of the foot
-    jaw                                                the joint
+A landmark is a mean of joints, or a vertex that a rule finds on the body's own template (`_Finder`), so that any body whose
+joints have SMPL-X's names has them. Sides are the person's. Joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the
+centre of the eyeball), knuckles `{side}_FINGER_1, 2, 3` from the palm outwards, and means of them: neck (of the shoulders, as
+OpenPose has it), mid_hip. Vertices: nose (or face_30), face_8 the chin, face_27 the root of the nose, ears, finger tips, and of
+each foot big_toe, small_toe, heel and the foremost, foot_index. The other 65 points of the face follow expressions, which
+bodies without a face rig do not have.
 
 Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. Where
-it is known at which places a detector sees its landmarks, they are moved there: `Place`. The other 65 points of the face are not
-on this list: they follow expressions, which bodies without a face rig do not have.
+it is known at which places a detector sees its landmarks, they are moved there: `Place`.
 """
 
 from collections.abc import Callable, Sequence

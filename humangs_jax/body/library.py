@@ -1,13 +1,8 @@
 """Loading a body: the CC0 body of the package, or a file; the package's own body file, one small npz without pickles; SMPL-X.
 
-Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the
-largest few of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows
-sum to 1.
-
-SMPL-X: a pose vector has 165 numbers: global_orient 3, body 63, jaw 3, left eye 3, right eye 3, left hand 45, right hand 45.
-Two conventions for the hands differ between datasets; both are required keyword arguments: `use_pca` (the hand numbers are
-coefficients of the model's principal components) and `flat_hand_mean` (True: zero means a flat hand; False: zero means
-the model's mean hand, which is added). The model's licence forbids redistribution: users bring the file.
+Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the largest few
+of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum to 1. SMPL-X's
+licence forbids redistribution: users bring the file.
 """
 
 from importlib import resources

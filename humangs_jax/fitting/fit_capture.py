@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model, pose_landmarks
-from humangs_jax.body.model import BodyModel, BodyPose, without_expression
+from humangs_jax.body.landmarks import LandmarkModel, kind_of, landmark_model
+from humangs_jax.body.model import BodyModel, without_expression
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
@@ -39,10 +39,10 @@ from humangs_jax.fitting.residuals.keypoints import (
     PLACE_STD,
     KeypointProblem,
     Observations,
+    body_errors,
     found_noise,
     frame_residuals,
     group_by_frame,
-    keypoint_errors,
 )
 from humangs_jax.fitting.swaps import find_swaps
 
@@ -158,7 +158,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     kind = keypoints.set
     model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
-    errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))
+    errors = np.asarray(body_errors(model, jnp.asarray(capture.betas), poses, observations, np.arange(len(views))))
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
@@ -189,14 +189,6 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     )
     landmarks = by_view(errors + np.asarray(observations.points))
     return Examination(report, landmarks, by_view(compared), by_view(outliers))
-
-
-@jax.jit
-def _errors(
-    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, observations: Observations
-) -> Float[Array, "m c k 2"]:
-    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
-    return jax.vmap(keypoint_errors)(observations, landmarks)
 
 
 def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.joints import BODY_NAMES
-from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
+from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
 from humangs_jax.body.model import (
     EXACT,
     BodyModel,
@@ -25,14 +25,21 @@ from humangs_jax.body.model import (
     pose_points,
     without_expression,
 )
-from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.fitting.report import Change, FitReport, ViewReport, how_far, limit_violations
 from humangs_jax.fitting.residuals import silhouettes
-from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, found_noise, keypoint_residuals, scaled_observations
+from humangs_jax.fitting.residuals.keypoints import (
+    NEAR,
+    Observations,
+    body_errors,
+    found_noise,
+    keypoint_residuals,
+    scaled_observations,
+)
 from humangs_jax.fitting.state import (
     NORMAL_MAD,
     FitState,
@@ -47,7 +54,6 @@ from humangs_jax.fitting.state import (
     solve,
     zero_state,
 )
-from humangs_jax.fitting.triangulation import reprojection_errors
 from humangs_jax.geometry.camera import Camera
 
 LEAST_NOISE = 0.7
@@ -293,9 +299,9 @@ class Scene:
         """Errors of the keypoints in pixels; NaN where there is none."""
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
         seen = replace(seen, K=cameras.K[:, None], cam_from_world=cameras.cam_from_world[:, None])
-        errors = _keypoint_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
+        errors = body_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
         known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
-        return np.where(known, np.asarray(errors), np.nan)[:, 0]
+        return np.where(known, np.linalg.norm(errors, axis=-1), np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
         """The body of a capture of these photos in every view."""
@@ -326,14 +332,6 @@ def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) ->
 def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose) -> Float[jax.Array, "m n 3"]:
     """Vertices of a person in a batch of m poses, metres."""
     return jax.lax.map(lambda pose: person_vertices(body, betas, pose), poses)
-
-
-@jax.jit
-def _keypoint_errors(
-    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, seen: Observations, frames: Int[np.ndarray | Array, " v"]
-) -> Float[Array, "v c k"]:
-    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
-    return jax.vmap(reprojection_errors)(seen, landmarks[frames])
 
 
 def _noise(boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]) -> float:

@@ -362,7 +362,7 @@ def test_wrong_axes_and_full_folders_are_refused(tmp_path):
 
 @pytest.fixture(scope="module")
 def problem(body):
-    return scan_problem(body_surface(body, ("left_hip", "nose"), 1500), body.joint_names)
+    return scan_problem(body_surface(body, ("left_hip", "nose"), 1500), body.joint_names, 22)
 
 
 @pytest.fixture(scope="module")

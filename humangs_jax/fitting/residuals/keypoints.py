@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel, kind_of, pose_landmarks
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
@@ -139,6 +140,15 @@ def keypoint_errors(observations: Observations, landmarks: Float[Array, "k 3"]) 
     seen = in_cameras(observations, landmarks)
     pixels = seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * focal_lengths(observations)
     return pixels + observations.K[:, None, :2, 2] - observations.points
+
+
+@jax.jit
+def body_errors(
+    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, seen: Observations, frames: Int[Array | np.ndarray, " n"]
+) -> Float[Array, "n c k 2"]:
+    """`keypoint_errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
+    landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
+    return jax.vmap(keypoint_errors)(seen, landmarks[frames])
 
 
 TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")

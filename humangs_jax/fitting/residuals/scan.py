@@ -125,11 +125,11 @@ class ScanProblem:
         return betas_of(self.origin, state), pose_of(self.origin, state)
 
 
-def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int | None = None) -> ScanProblem:
-    """The problem with the joints of these names free, and at most `coefficients` of the shape (default: all)."""
+def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int) -> ScanProblem:
+    """The problem with the joints of these names free, and at most `coefficients` of the shape."""
     model, available = surface.landmarks, surface.points.directions.shape[-1]
     joints = tuple(j for j, name in enumerate(model.joint_names) if j > 0 and name in names)
-    origin = usual_origin(pose_prior(model.joint_names), joints, min(available, coefficients or available))
+    origin = usual_origin(pose_prior(model.joint_names), joints, min(available, coefficients))
     height = np.asarray(surface.points.rest)[:, 1]
     return ScanProblem(surface, origin, (int(height.argmax()), int(height.argmin())))
 
@@ -224,7 +224,7 @@ class Target:
         self.points, self.normals = align(scan.points), scan.normals @ align.rotation.T
         self.count, self.effective = min(count, len(self.points)), effective
         self.normal = normal
-        self.tree = _tree(self.points, normal * self.normals)
+        self.tree = KDTree(_with_normals(self.points, normal * self.normals))
 
     def matches(
         self, problem: ScanProblem, state: FitState, gate: float, robust_scale: float, tolerances: Tolerances
@@ -234,18 +234,7 @@ class Target:
         Arguments: gate: pairs that are farther apart, in units of the frame, have no weight. robust_scale: distance along the
         normal at which weights have fallen to a quarter.
         """
-        vertices, normals = self._posed(problem, state)
-        looking = np.flatnonzero(np.asarray(problem.surface.order) < self.count)
-        of_body = _nearest(self.tree, vertices[looking], self.normal * normals[looking])
-        some, like = self.points[: self.count], self.normals[: self.count]
-        of_scan = _nearest(_tree(vertices, self.normal * normals), some, self.normal * like)
-        rows = np.concatenate([of_scan, looking])
-        points = np.concatenate([some, self.points[of_body]])
-        facing = np.concatenate([normals[of_scan], self.normals[of_body]])
-        other = np.concatenate([like, normals[looking]])
-        apart = points - vertices[rows]
-        good = (np.einsum("ra,ra->r", facing, other) > LIKE) & (np.linalg.norm(apart, axis=1) < gate)
-        away = np.einsum("ra,ra->r", facing, apart)
+        rows, points, facing, away, good = self._pairs(problem, state, gate)
         fading = np.square(1 / (1 + np.square(away / robust_scale)))  # Geman and McClure's loss, as weights
         inside, outside = float(tolerances.inside), float(tolerances.outside)
         covered = np.asarray(problem.surface.covered)[rows]
@@ -260,23 +249,26 @@ class Target:
 
     def distances(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[Float[np.ndarray, " r"], float]:
         """How far scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
-        one = jnp.float32(1.0)
-        matches = self.matches(problem, state, gate, np.inf, Tolerances(one, one, one))
-        vertices, _ = self._posed(problem, state)
-        rows, points, normals, weights = (
-            np.asarray(x)[: self.count] for x in (matches.rows, matches.points, matches.normals, matches.weights)
-        )
-        away = np.einsum("ra,ra->r", normals, points - vertices[rows])
-        return away[weights > 0], float((weights > 0).mean())
+        away, good = (x[: self.count] for x in self._pairs(problem, state, gate)[3:])
+        return away[good], float(good.mean())
 
-    def _posed(self, problem: ScanProblem, state: FitState) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        vertices, normals = pose_surface(problem.surface, *problem.body(state))
-        return np.asarray(vertices, np.float64) / float(scale_of(state)), np.asarray(normals, np.float64)
+    def _pairs(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[np.ndarray, ...]:
+        """Vertices (r,), points (r, 3), normals (r, 3), distances (r,), and which pairs are near and alike (r,)."""
+        vertices, normals = (np.asarray(x, np.float64) for x in pose_surface(problem.surface, *problem.body(state)))
+        vertices = vertices / float(scale_of(state))
+        looking = np.flatnonzero(np.asarray(problem.surface.order) < self.count)
+        of_body = self.tree.query(_with_normals(vertices[looking], self.normal * normals[looking]))[1]
+        some, like = self.points[: self.count], self.normals[: self.count]
+        tree = KDTree(_with_normals(vertices, self.normal * normals))
+        of_scan = tree.query(_with_normals(some, self.normal * like))[1]
+        rows = np.concatenate([of_scan, looking])
+        points = np.concatenate([some, self.points[of_body]])
+        facing = np.concatenate([normals[of_scan], self.normals[of_body]])
+        other = np.concatenate([like, normals[looking]])
+        apart = points - vertices[rows]
+        good = (np.einsum("ra,ra->r", facing, other) > LIKE) & (np.linalg.norm(apart, axis=1) < gate)
+        return rows, points, facing, np.einsum("ra,ra->r", facing, apart), good
 
 
-def _tree(points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> KDTree:
-    return KDTree(np.concatenate([points, normals], axis=1))
-
-
-def _nearest(tree: KDTree, points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> Int[np.ndarray, " r"]:
-    return tree.query(np.concatenate([points, normals], axis=1))[1]
+def _with_normals(points: Float[np.ndarray, "r 3"], normals: Float[np.ndarray, "r 3"]) -> Float[np.ndarray, "r 6"]:
+    return np.concatenate([points, normals], axis=1)
