@@ -37,6 +37,21 @@ def test_cameras_are_read_as_written(kind, tmp_path):
         np.testing.assert_allclose([camera.distortion for camera in found.cameras], [lens] * 4, atol=EXACT)
 
 
+@pytest.mark.parametrize("place", ["frame", "file"])
+def test_a_whole_K_of_a_frame_or_of_the_file(place, tmp_path):
+    """As DNA-Rendering's views are written for nerfstudio."""
+    file = tmp_path / "transforms.json"
+    written.write_transforms(file, K, POSES, written.FILES)
+    values = json.loads(file.read_text())
+    for frame, k in zip(values["frames"], K.tolist(), strict=True):
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            frame.pop(key)
+        (frame if place == "frame" else values).setdefault("K", k)
+    file.write_text(json.dumps(values))
+    found = read_calibration(file, lambda name: SIZE)
+    np.testing.assert_allclose([camera.K for camera in found.cameras], K if place == "frame" else [K[0]] * 4, atol=EXACT)
+
+
 def test_a_binary_model_of_colmap_is_the_text_model(tmp_path):
     world = written.points()
     seen = [written.project(k, pose, world) for k, pose in zip(K, POSES, strict=True)]
@@ -113,8 +128,7 @@ def test_a_person_is_undistorted_as_the_whole_photo_is(focal, coefficients):
 
 
 def test_distortion_is_opencvs():
-    # by hand: r^2 = 0.05, radial = 1 + 0.1 * 0.05 - 0.2 * 0.0025 + 0.5 * 0.000125
-    radial = 1 + 0.005 - 0.0005 + 0.0000625
+    radial = 1 + 0.1 * 0.05 - 0.2 * 0.0025 + 0.5 * 0.000125  # by hand: r^2 = 0.05
     x = 0.1 * radial + 2 * 0.01 * 0.02 + 0.03 * (0.05 + 0.02)
     y = 0.2 * radial + 0.01 * (0.05 + 0.08) + 2 * 0.03 * 0.02
     got = distort(np.asarray([0.1, 0.2]), np.asarray([0.1, -0.2, 0.01, 0.03, 0.5]))

@@ -44,7 +44,7 @@ from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, counted, few
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import is_heic, oriented, read_grey, read_image, write_png
+from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading
 
 SIZES_SHOWN = 5
@@ -303,8 +303,9 @@ def _rewrite(
     Returns: the paths for capture.json, and whether the person reaches a rim where the photo is padded.
     """
     image, alpha = read_checked(read_image, photo.image)
-    image, alpha = oriented(image, turn.photo), oriented(alpha, turn.photo) if transparent and alpha is not None else None
-    mask = alpha if photo.mask is None else oriented(read_checked(read_grey, photo.mask), turn.mask)
+    image = turn.upright(image, turn.photo)
+    alpha = turn.upright(alpha, turn.photo) if transparent and alpha is not None else None
+    mask = alpha if photo.mask is None else turn.upright(read_checked(read_grey, photo.mask), turn.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
         mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))

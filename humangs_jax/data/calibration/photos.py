@@ -2,7 +2,7 @@
 
 Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it. What an import writes has none:
 pixels are turned upright, and with them the camera, if it was calibrated for the pixels as stored (COLMAP). A calibration of the
-turned photo (OpenCV) is told by its size. No camera sees a mirrored photo.
+turned photo (OpenCV) is told by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
 """
 
 import dataclasses
@@ -12,11 +12,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.io.images import image_size, open_image, orientation, read_image
+from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
 """File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
@@ -150,7 +151,9 @@ def _photos_in(folder: Path) -> dict[str, Path]:
 # Orientation ----------------------------------------------------------------------------------------------------------
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
-"""Clockwise quarter turns that a flag asks for; the other ones mirror."""
+"""Clockwise quarter turns that a flag asks for."""
+MIRRORED, MIRROR = {2: 1, 4: 3, 5: 6, 7: 8}, 2
+"""Flags that mirror besides, and those that only turn; and the one that only mirrors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,8 +168,14 @@ class Turn:
     """Of the camera, 0 for a calibration of the turned photo."""
     size: tuple[int, int]
     """Width and height after it."""
-    certain: bool = True
+    certain: bool
     """Whether sizes tell what was calibrated."""
+    mirrored: bool
+    """Whether pixels are mirrored back, because the calibration is of those as stored."""
+
+    def upright(self, pixels: Float[np.ndarray, "h w *c"], flag: int) -> Float[np.ndarray, "height width *c"]:
+        """Pixels as a flag wants them shown, but not mirrored."""
+        return oriented(oriented(pixels, flag), MIRROR if self.mirrored else 1)
 
     @property
     def rewrites(self) -> bool:
@@ -178,7 +187,7 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     """One for each photo.
 
     Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
-    calibrated for pixels as stored, but whose photos have different flags, or one that mirrors.
+    calibrated for pixels as stored, but whose photos have different flags.
     """
     turns = tuple(_find_turn(calibration.cameras[photo.camera], photo, calibration.upright) for photo in photos)
     first: dict[int, tuple[Photo, Turn]] = {}
@@ -203,10 +212,9 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
             problem += "; was it turned (an EXIF orientation that got lost)?"
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
     as_stored = calibrated == stored and not upright
-    if as_stored and flag not in QUARTERS:
-        raise CaptureError(photo.image, "", f"EXIF orientation {flag} mirrors what the camera saw: expected the photo without it")
     mask = 1 if photo.mask is None else _mask_flag(photo.mask, flag, stored, shown)
-    return Turn(flag, mask, QUARTERS[flag] if as_stored else 0, shown, certain=flag == 1 or stored != shown or upright)
+    quarters, certain = QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0, flag == 1 or stored != shown or upright
+    return Turn(flag, mask, quarters, shown, certain, as_stored and flag in MIRRORED)
 
 
 def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
@@ -268,7 +276,7 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
     if not flagged:
         return [], []
     whole = "the calibration is of the turned photos"
-    if any(turn.quarters for _, turn in flagged):
+    if any(turn.quarters or turn.mirrored for _, turn in flagged):
         whole = "their cameras, too: the calibration is of the pixels as stored"
     notes, warnings = [f"turned upright by the EXIF orientation: {counted(len(flagged), 'photo')} ({whole})"], []
     if unsure := [(photo, turn) for photo, turn in flagged if not turn.certain]:
@@ -278,6 +286,8 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
             f"EXIF orientation {unsure[0][1].photo} of {which}: the calibration is taken to be of the stored pixels{of_masks}; "
             "their sizes do not tell. If that is wrong, save the photos turned"
         )
+    if mirrored := [photo.image.name for photo, turn in flagged if turn.mirrored]:
+        warnings.append(f"EXIF asks to mirror {mirrored[0]}: turned, not mirrored, as no camera sees so")
     return notes, warnings
 
 

@@ -196,6 +196,8 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 MASK_KEYS = ("fg_mask_path", "mask_path")
 """Of VHAP and of nerfstudio."""
+MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
+"""Keys of a whole K, of a frame or of the file."""
 
 
 def recognizes_transforms(source: Source) -> bool:
@@ -237,18 +239,22 @@ def _frame_camera(
     size = None
     if "w" in values or "h" in values:
         size = image_size([required(values, key, file, prefix) for key in ("w", "h")], file, f"{prefix}w, h")
-    elif not {"fl_x", "cx", "cy"} <= values.keys():
+    elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
         size = photo_size(name)
     width, height = size or (None, None)
+    whole = next((key for key in MATRICES if key in values and "fl_x" not in values), None)
     # square pixels and a centred axis where the file does not say otherwise
     focal = {axis: number(f"fl_{axis}") for axis in "xy" if f"fl_{axis}" in values}
     for axis, side in zip("xy", size or (), strict=False):
         if axis not in focal and f"camera_angle_{axis}" in values:
             focal[axis] = 0.5 * side / np.tan(0.5 * number(f"camera_angle_{axis}"))
-    if not focal:
-        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x")
-    center = [number(key) if key in values else 0.5 * (side or 0) for key, side in (("cx", width), ("cy", height))]
-    K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
+    if whole is not None:
+        K = floats(values[whole], file, f"{prefix}{whole}", (3, 3))
+    elif focal:
+        center = [number(key) if key in values else 0.5 * (side or 0) for key, side in (("cx", width), ("cy", height))]
+        K = intrinsics(*(focal.get(axis, next(iter(focal.values()))) for axis in "xy"), *center)
+    else:
+        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
     lens = [number(key) if key in values else 0.0 for key in ("k1", "k2", "p1", "p2", "k3")]
     pose = floats(required(values, "transform_matrix", file, prefix), file, f"{prefix}transform_matrix", (4, 4))
     try:
@@ -260,8 +266,8 @@ def _frame_camera(
 
 # Moments ---------------------------------------------------------------------------------------------------------------
 
-MOMENT_KEYS = ("timestep_index", "timestep", "time", "timestep_id")
-CAMERA_KEYS = ("camera_index", "camera_id")
+MOMENT_KEYS = ("timestep_index", "timestep", "timestep_index_original", "time", "timestamp", "time_id", "timestep_id")
+CAMERA_KEYS = ("camera_index", "camera_id", "cam_id", "camera_label")
 SAME_TIME = 1e-6
 """Times that differ by less are one moment written twice."""
 SAME_POSE = 1e-9
@@ -286,7 +292,7 @@ def _find_moments(frames: Sequence[Mapping[str, Any]], cameras: Sequence[Calibra
         which = f"the {owner} {owners[repeated[0]]}" if owner else "the same camera pose"
         problem = f"frames[{repeated[0]}] and frames[{repeated[1]}] have {which}, so they show different moments"
         raise CaptureError(file, "frames", f"{problem}: expected timestep_index or time in each frame to tell which are of one")
-    ranks = _ranks(times) if key else [0] * len(frames)
+    ranks = _ranks(times, key, file) if key else [0] * len(frames)
     taken: dict[Any, int] = {}
     for i, moment in enumerate(zip(owners, ranks, strict=True)):
         if owner and (other := taken.setdefault(moment, i)) != i:
@@ -304,12 +310,12 @@ def _values(frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
         if not isinstance(value, str):
             floats(expect(value, float, file, f"frames[{i}].{key}"), file, f"frames[{i}].{key}", ())
         values.append(value)
-    if len({isinstance(value, str) for value in values}) > 1:
-        raise CaptureError(file, key, "expected numbers or names, got both")
     return key, values
 
 
-def _ranks(times: Sequence[Any]) -> list[int]:
+def _ranks(times: Sequence[Any], key: str, file: Path) -> list[int]:
+    if len({isinstance(time, str) for time in times}) > 1:
+        raise CaptureError(file, key, "expected numbers or names, got both")
     known = sorted(set(times))
     ranks = range(len(known))
     if not isinstance(known[0], str):

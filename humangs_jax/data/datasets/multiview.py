@@ -71,6 +71,8 @@ PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255
 """Least value of a mask on the person: above 128."""
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
+"""Names of photos, those of ActorsHQ included."""
 T = TypeVar("T")
 Photo = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
 """Image on white and mask, both in [0, 1]."""
@@ -89,7 +91,7 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     eyes = np.zeros((count, 6))
     parts = [angles[key] for key in ("global_orient", "body_pose", "jaw_pose")]
     rotations = np.concatenate([*parts, eyes, angles["left_hand_pose"], angles["right_hand_pose"]], axis=1)
-    shape = [values.numbers(key, (None, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
+    shape = [np.atleast_2d(values.numbers(key, None, LARGEST_COEFFICIENT))[0] for key in ("betas", "expression")]
     betas = coefficients(body.model, shape[0], shape[1], file)
     return BodyParameters(betas, rotations.reshape(count, -1, 3), translations)
 
@@ -119,9 +121,9 @@ def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
 
 
 def numbered(folder: Path) -> dict[int, Path]:
-    """Frame -> its file, of the photos in a folder, by the number at the end of the name; empty if it does not exist."""
+    """Frame -> its file, of the photos in a folder that are called by a number; empty if it does not exist."""
     names = [name for name in (os.listdir(folder) if folder.is_dir() else ()) if name.lower().endswith(PHOTO_SUFFIXES)]
-    return {int(found[1]): folder / name for name in names if (found := re.search(r"(\d+)\.\w+$", name))}
+    return {int(found[1]): folder / name for name in names if (found := PHOTO.fullmatch(name))}
 
 
 def read_missing(file: Path) -> set[tuple[str, int]]:

@@ -93,8 +93,9 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
     file = _list_of(path)
     scenes = read_scene_list(file)
     if size is None:
-        firsts = (file.parent / scene_frames(file, name, scene)[0].image for name, scene in scenes.items())
-        first = next((image for image in firsts if image.is_file()), None)
+        firsts = [frame for name, scene in scenes.items() for frame in members(scene, file, name, frames=list)[0][:1]]
+        images = (file.parent / str(frame.get("image_path")) for frame in firsts if isinstance(frame, dict))
+        first = next((image for image in images if image.is_file()), None)
         size = STORED_SIZE if first is None else max(read_checked(image_size, first))
     opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)
     return tuple(Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items())

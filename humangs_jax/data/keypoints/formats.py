@@ -161,8 +161,6 @@ def _is_people_file(content: Any) -> bool:
 
 def _image(image: Any, count: int, path: Path, field: str) -> ImagePeople:
     name, width, height, people = members(image, path, field, image=str, width=int, height=int, people=list)
-    if min(width, height) < 1:
-        raise CaptureError(path, field, f"expected width and height in pixels, got {width!r} and {height!r}")
     found = (_own_person(each, count, path, f"{field}.people[{i}]") for i, each in enumerate(people))
     return ImagePeople(name, (width, height), tuple(found))
 
@@ -203,12 +201,16 @@ def _openpose_person(person: Any, file: Path, field: str) -> Float[np.ndarray, "
     (body,) = members(person, file, field, pose_keypoints_2d=list)
     if len(body) % 3 == 0 and len(body) // 3 in SETS_BY_COUNT:
         return triples(body, file, f"{field}.pose_keypoints_2d")
-    # an empty list means that the part was not detected; older versions leave it out
-    parts = [
+    return _parts(person, OPENPOSE_PARTS, file, field)
+
+
+def _parts(person: dict[str, Any], counts: dict[str, int], file: Path, field: str) -> Float[np.ndarray, "k 3"]:
+    """The points of the parts of a person; those that were not detected are left out, or empty lists."""
+    points = [
         triples(person[key], file, f"{field}.{key}", count) if person.get(key) else np.zeros((count, 3))
-        for key, count in OPENPOSE_PARTS.items()
+        for key, count in counts.items()
     ]
-    return np.concatenate(parts)
+    return np.concatenate(points)
 
 
 # EasyMocap's annots ----------------------------------------------------------------------------------------------------
@@ -245,8 +247,8 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
 
 # COCO ------------------------------------------------------------------------------------------------------------------
 
-COCO_PARTS = {"foot_kpts": 6, "face_kpts": 68, "lefthand_kpts": 21, "righthand_kpts": 21}
-"""COCO-WholeBody's, in the order of its 133 points, after the 17 of the body."""
+COCO_PARTS = {"keypoints": 17, "foot_kpts": 6, "face_kpts": 68, "lefthand_kpts": 21, "righthand_kpts": 21}
+"""COCO-WholeBody's, in the order of its 133 points."""
 HIDDEN_CONFIDENCE = 0.5
 """For points that an annotator guessed behind something else."""
 LARGEST_VISIBILITY = 2
@@ -305,19 +307,12 @@ def _image_label(value: Any, file: Path, field: str) -> str | int:
 
 def _whole_body(entries: list[Any]) -> bool:
     """Whether some person has a part of COCO-WholeBody; those who lack it have its points with confidence 0."""
-    return any(isinstance(entry, dict) and not COCO_PARTS.keys().isdisjoint(entry) for entry in entries)
+    return any(isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries)
 
 
 def _coco_person(entry: dict[str, Any], file: Path, field: str, whole: bool) -> Float[np.ndarray, "k 3"]:
     (keypoints,) = members(entry, file, field, keypoints=list)
-    body = triples(keypoints, file, f"{field}.keypoints", 17 if whole else None)
-    if not whole:
-        return body
-    parts = [
-        triples(entry[key], file, f"{field}.{key}", count) if entry.get(key) else np.zeros((count, 3))
-        for key, count in COCO_PARTS.items()
-    ]
-    return np.concatenate([body, *parts])
+    return _parts(entry, COCO_PARTS, file, field) if whole else triples(keypoints, file, f"{field}.keypoints")
 
 
 def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> Float[np.ndarray, "k 3"]:

@@ -221,7 +221,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     frames in twelve digits), or are mere numbers (COCO's image ids, the frames of a video).
 
     Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way round, there are as many of
-    either, without gaps, and they are matched in order, for each video by itself.
+    either, without gaps, and they are matched in order, for each video by itself; mere numbers also if they begin elsewhere.
 
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
@@ -237,11 +237,13 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
         if number is not None:
             videos.setdefault(prefix, []).append((number, image))
     of_view = [_split_number(name)[0] for name in names]
+    first_view = min((int(number) for name in names for number in re.findall(r"\d+", name)[-1:]), default=0)
     for prefix, frames in videos.items():
         numbers = sorted(number for number, _ in frames)
-        if numbers[0] > 1 or len(numbers) < 2 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+        shift = first_view - numbers[0] if prefix is None else 1 - 2 * numbers[0]
+        gaps = numbers != list(range(numbers[0], numbers[0] + len(numbers)))
+        if gaps or len(numbers) < 2 or (prefix is not None and numbers[0] > 1):
             continue
-        shift = 1 - 2 * numbers[0]
         moved = {image: find(n + shift if prefix is None else f"{prefix}{n + shift}") for n, image in frames}
         prefixes = {of_view[view] for views in moved.values() for view in views}
         all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 from dataset_files import VERTICES, fit_values, model_arrays, scan_vertices, write_model, write_thuman
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from humangs_jax.data.datasets.thuman import open_thuman
@@ -19,6 +19,7 @@ vectors = st.lists(st.floats(-1, 1), min_size=3, max_size=3).map(np.asarray).fil
 
 
 @given(vectors, vectors)
+@example(-UP, UP)
 def test_the_smallest_rotation_turns_one_direction_into_the_other(start, end):
     R = protocol.smallest_rotation(start, end)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
@@ -27,12 +28,6 @@ def test_the_smallest_rotation_turns_one_direction_into_the_other(start, end):
     np.testing.assert_allclose(R @ a, b, atol=1e-7)
     # smallest: its angle is that between the two
     assert np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(np.arccos(np.clip(a @ b, -1, 1)), abs=1e-5)
-
-
-def test_opposite_directions_are_half_a_turn_apart():
-    np.testing.assert_allclose(protocol.smallest_rotation(-UP, UP) @ -UP, UP, atol=1e-12)
-    with pytest.raises(ValueError, match="no length"):
-        protocol.smallest_rotation(np.zeros(3), UP)
 
 
 def test_cameras_look_at_the_origin_from_the_protocols_ranges():
