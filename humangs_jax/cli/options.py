@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import os
 import re
-import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -191,17 +190,14 @@ def require_file(path: Path, suffixes: tuple[str, ...], option: str = "--out", r
     for each in read:
         if each is not None and path.exists() and each.exists() and path.samefile(each):
             raise UsageError(f"{option} {path}: is read by this command: expected another name")
-    _require_writable(path.parent, f"{option} {path}")
+    _require_writable(path, option)
 
 
 def require_folder(path: Path, option: str = "--out") -> None:
     """Files can be written into that folder, which is made if it does not exist. Raises: UsageError."""
     if path.exists() and not path.is_dir():
         raise UsageError(f"{option} {path}: is a file: expected the name of a folder")
-    above = next((parent for parent in (path, *path.absolute().parents) if parent.exists()), Path("/"))
-    if not above.is_dir():
-        raise UsageError(f"{option} {path}: {above} is no folder")
-    _require_writable(above, f"{option} {path}")
+    _require_writable(path, option)
 
 
 def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()) -> None:
@@ -215,12 +211,13 @@ def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterab
         raise UsageError(f"--out {error}") from error
 
 
-def _require_writable(folder: Path, named: str) -> None:
-    """Tried, because permissions do not tell of full, read-only and network disks."""
+def _require_writable(path: Path, option: str) -> None:
+    from humangs_jax.io.atomic import check_writable
+
     try:
-        tempfile.TemporaryFile(dir=folder).close()
+        check_writable(path)
     except OSError as error:
-        raise UsageError(f"{named}: cannot write to {folder}: {error.strerror or error}") from error
+        raise UsageError(f"{option} {error}") from error
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:

@@ -10,6 +10,7 @@ import os
 import platform
 import re
 import shutil
+import tempfile
 import time
 import uuid
 import zlib
@@ -278,14 +279,15 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Whether a file, or a folder with all above it, can be made, to be asked before the work begins.
 
-    Raises: FileNotFoundError, NotADirectoryError or PermissionError, which are OSErrors, naming `path`.
+    Tried, because permissions do not tell of full, read-only and network disks. Raises: OSError, naming `path`.
     """
     path = Path(path)
-    above = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
-    if not above.is_dir() and above != path:
-        raise NotADirectoryError(f"{path}: cannot be made: {above} is no folder")
-    if not os.access(above if above.is_dir() else above.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: cannot be written: {above} is read-only or belongs to somebody else")
+    place = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    place = place.parent if place == path and not path.is_dir() else place
+    try:
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise type(error)(f"{path}: cannot write to {place}: {error.strerror or error}") from error
 
 
 def _tag() -> str:
