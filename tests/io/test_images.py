@@ -71,15 +71,6 @@ def test_enlarging_is_bicubic(size):
     np.testing.assert_allclose(resized(image, *size)[inside], np.clip(theirs, image.min(), image.max())[inside], atol=ROUNDING)
 
 
-def test_a_ramp_stays_a_ramp():
-    """So that intrinsics that follow the pixels see the same point; pixels that are cut in two are off by an eighth at most."""
-    ramp = np.linspace(0, 1, 24, dtype=np.float32)[:, None] + np.zeros((1, 7), np.float32)
-    for size in (5, 9, 17, 40, 101):
-        centres = (np.arange(size) + 0.5) * 24 / size - 0.5
-        inside, atol = (centres > 1) & (centres < 22), ROUNDING if size > 24 else 1 / 8 / 23
-        np.testing.assert_allclose(resized(ramp, 7, size)[inside, 3], centres[inside] / 23, atol=atol)
-
-
 def test_bytes_are_averaged_as_numbers():
     image = np.full((4, 6, 3), 255, np.uint8)
     np.testing.assert_array_equal(resized(image, 4, 3), np.full((3, 4, 3), 255, np.float32))
@@ -169,13 +160,9 @@ PHOTO = np.random.default_rng(0).integers(0, 255, (*PERSON.shape, 3), np.uint8)
 RAMP = [value for value in range(256) for _ in range(3)]
 READ = {
     "grey": pixels(grey(PERSON)),
-    "1 bit": (Image.fromarray(PERSON), {}),
     "16 bits": pixels(np.where(PERSON, 65535, 0).astype(np.uint16)),
     "one label": palette(PERSON * 1, VOC),
-    "another label": palette(PERSON * 3, VOC),
     "a label that is grey": palette(PERSON * 7, VOC),
-    "labels on a ramp of greys": palette(PERSON * 1, RAMP),
-    "a white palette": palette(PERSON * 1, [0, 0, 0, 255, 255, 255]),
     "no label 0": palette(np.where(PERSON, 3, 2), [0, 0, 255, 0, 255, 0, 0, 0, 0, 128, 0, 0]),
     "fewer colors than labels": palette(PERSON * 1, [0, 0, 0]),
     "an opaque palette": palette(PERSON * 1, VOC, transparency=bytes([255, 255])),
@@ -183,7 +170,6 @@ READ = {
     "red": pixels(colored(PERSON, (255, 0, 0))),
     "a cut-out": pixels(np.dstack([PHOTO, grey(PERSON)])),
     "white with alpha": pixels(np.dstack([np.full_like(PHOTO, 255), grey(PERSON)])),
-    "black with alpha": pixels(np.dstack([np.zeros_like(PHOTO), grey(PERSON)])),
     "greys equal to alpha": pixels(np.dstack([grey(PERSON), grey(PERSON)])),
     "opaque alpha": pixels(np.dstack([grey(PERSON), np.full_like(grey(PERSON), 255)])),
 }
@@ -221,7 +207,6 @@ TWO = PERSON * 1 + (np.arange(8) > 3) * PERSON
 REFUSED = {
     "a palette of the labels 1, 2: which is the person": palette(TWO, VOC),
     "a palette of the labels 0, 1: 0 is not black: which is the background": palette(PERSON * 1, [9, 9, 200, 200, 9, 9]),
-    "labels 0, 1: 0 is not black": palette(PERSON * 1, [255, 255, 255, 0, 0, 0]),
     "2 colors: which is the person": pixels(colored(TWO == 1, (255, 0, 0)) + colored(TWO == 2, (0, 255, 0))),
     "2 colors without black: which": pixels(colored(PERSON, (255, 0, 0), (0, 0, 200))),
     "an alpha channel besides its greys": pixels(np.dstack([grey(TWO == 1), grey(PERSON)])),
