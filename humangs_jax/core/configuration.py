@@ -14,6 +14,7 @@ import dataclasses
 import difflib
 import functools
 import json
+import math
 import numbers
 import sys
 import types
@@ -25,7 +26,7 @@ T = TypeVar("T")
 KIND = "kind"
 """Key of the class of a part."""
 LARGEST, LARGEST_INTEGER = sys.float_info.max, 1 << 63
-"""Numbers beyond these have no place in any configuration."""
+"""Numbers and integers beyond these have no place in any configuration."""
 
 
 MOST_ITEMS = 256
@@ -125,14 +126,16 @@ class Presets(dict[str, T]):
         raise UnknownPresetError(f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}")
 
 
-def check_fields(config: Any) -> None:
-    """Checks that the fields of a configuration are what their annotations say; for `__post_init__`.
+def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
+    """Checks that values of fields are what the annotations of a configuration say, and in their ranges.
 
-    Any integer and any real number will do. Raises: ValueError naming class and field.
+    Any integer and any real number will do. owner: what the message begins with. Raises: ValueError naming owner and field.
     """
-    for name, annotation in _annotations(type(config)).items():
-        if name in field_names(type(config)) and not _fits(value := getattr(config, name), annotation):
-            raise ValueError(f"{type(config).__name__}: {name}: expected {in_words(annotation)}, got {value!r}")
+    annotations = _annotations(cls)
+    for name, value in values.items():
+        check_range(cls, name, value, f"{owner}.{name}")
+        if not _fits(value, annotations[name]):
+            raise ValueError(f"{owner}.{name}: expected {in_words(annotations[name])}, got {value!r}")
 
 
 @functools.cache
@@ -147,12 +150,16 @@ def _fits(value: Any, annotation: Any) -> bool:
         return any(_fits(value, option) for option in arguments)
     if origin is Literal:
         return isinstance(value, str | int | None) and value in arguments
-    if annotation in (bool, int, float):
-        kind = {bool: bool, int: numbers.Integral, float: numbers.Real}[annotation]
-        return isinstance(value, kind) and (annotation is bool or not isinstance(value, bool))
-    if annotation in (str, type(None)) or dataclasses.is_dataclass(annotation):
+    if annotation in (int, float):
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral if annotation is int else numbers.Real):
+            return False
+        return abs(int(value)) <= LARGEST_INTEGER if isinstance(value, numbers.Integral) else math.isfinite(value)
+    if origin is tuple:
+        items = arguments[:1] * len(value) if arguments[-1] is Ellipsis and isinstance(value, tuple) else arguments
+        return isinstance(value, tuple) and len(items) == len(value) and all(map(_fits, value, items))
+    if annotation in (bool, str, type(None)) or dataclasses.is_dataclass(annotation):
         return isinstance(value, annotation)
-    return origin is not tuple or isinstance(value, tuple)
+    return True
 
 
 def in_words(annotation: Any) -> str:
@@ -171,9 +178,8 @@ def configuration(cls: type[T]) -> type[T]:
     own = getattr(cls, "__post_init__", None)
 
     def __post_init__(self):
-        check_fields(self)
-        for name in _ranges(type(self)):
-            check_range(type(self), name, getattr(self, name), f"{type(self).__name__}.{name}")
+        cls = type(self)
+        check_fields(cls, {name: getattr(self, name) for name in field_names(cls)}, cls.__name__)
         if own is not None:
             own(self)
         if isinstance(self, Part):
@@ -334,7 +340,7 @@ def config_from_json(cls: type[T], text: str) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """A JSON value, converted to its annotation."""
+    """A JSON value as its annotation has it, if it fits."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if _is_part(annotation) and isinstance(value, dict):
         cls = _find_part(value.get(KIND), annotation, path)
@@ -343,22 +349,13 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
         return _build_dataclass(annotation, value, path)
     if origin in (typing.Union, types.UnionType):
         options = [option for option in arguments if option is not type(None)]
-        if value is None and len(options) < len(arguments):
-            return None
-        if len(options) == 1:
-            return _build(options[0], value, path)
+        return _build(options[0], value, path) if value is not None and len(options) == 1 else value
     if origin is tuple and isinstance(value, list):
-        whole = len(arguments) == 2 and arguments[1] is Ellipsis
-        items = [arguments[0]] * len(value) if whole else list(arguments)
-        if len(value) > MOST_ITEMS:
-            raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
-        if len(items) == len(value):
-            return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
-    elif not _is_part(annotation) and _fits(value, annotation):
-        most = LARGEST if annotation is float else LARGEST_INTEGER
-        if not isinstance(value, int | float) or abs(value) <= most:  # nor NaN
-            return float(value) if annotation is float else value
-    raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
+        items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(items) != len(value) or len(value) > MOST_ITEMS:
+            return tuple(value)
+        return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
+    return float(value) if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER else value
 
 
 def _find_part(kind: Any, base: Any, path: str) -> type:
@@ -384,8 +381,7 @@ def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     needed = [f.name for f in dataclasses.fields(cls) if f.name in annotations and required(f)]
     if missing := [name for name in needed if name not in fields]:
         raise ValueError(f"{path}.{missing[0]} is missing")
-    for name, value in fields.items():
-        check_range(cls, name, value, f"{path}.{name}")
+    check_fields(cls, fields, path)
     try:
         return cls(**fields)
     except ArithmeticError as error:  # sizes of 0

@@ -106,13 +106,13 @@ def test_wrong_arguments_are_named(name):
 @pytest.mark.parametrize(
     ("config", "change", "words"),
     [
-        (hg.Settings(), {"splat": "fst"}, "Settings: splat: expected one of 'as_trained', .*, got 'fst'"),
-        (Runtime(), {"attention": "flash"}, "Runtime: attention: expected one of 'auto', 'xla', "),
-        (Runtime(), {"crop": "yes"}, "Runtime: crop: expected bool, got 'yes'"),
-        (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
-        (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),
-        (CONFIG.conventions, {"tokens": "front"}, "Conventions: tokens: expected one of 'all', 'foreground', got 'front'"),
-        (CONFIG, {"runtime": "fast"}, "HumanGSConfig: runtime: expected Runtime, got 'fast'"),
+        (hg.Settings(), {"splat": "fst"}, r"Settings\.splat: expected one of 'as_trained', .*, got 'fst'"),
+        (Runtime(), {"attention": "flash"}, r"Runtime\.attention: expected one of 'auto', 'xla', "),
+        (Runtime(), {"crop": "yes"}, r"Runtime\.crop: expected bool, got 'yes'"),
+        (hg.SplatConfig(), {"tile_size": 8.0}, r"SplatConfig\.tile_size: expected int, got 8.0"),
+        (hg.RefineConfig(), {"steps": "10"}, r"RefineConfig\.steps: expected one of int, None, got '10'"),
+        (CONFIG.conventions, {"tokens": "front"}, r"Conventions\.tokens: expected one of 'all', 'foreground', got 'front'"),
+        (CONFIG, {"runtime": "fast"}, r"HumanGSConfig\.runtime: expected Runtime, got 'fast'"),
     ],
 )
 def test_wrong_fields_of_configurations_are_named(config, change, words):
@@ -132,10 +132,10 @@ class Fields:
 
 def test_numbers_of_any_library_are_numbers():
     for fields in (Fields(), Fields(1, 3, "b", ("x",)), Fields(np.float32(2), np.int64(3)), Fields(np.float64(2))):
-        check_fields(fields)
+        check_fields(Fields, vars(fields), "Fields")
     for fields in (Fields(True), Fields("1"), Fields(count=True), Fields(kind="c"), Fields(names=["x"]), Fields(None)):
-        with pytest.raises(ValueError, match=r"^Fields: \w+: expected "):
-            check_fields(fields)
+        with pytest.raises(ValueError, match=r"^Fields\.\w+: expected "):
+            check_fields(Fields, vars(fields), "Fields")
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ def test_a_part_of_this_name_exists_once_and_only_a_registered_one_is_written():
     ("make", "message"),
     [
         (lambda: LookingReader(width=0), r"LookingReader\.width 0: expected 1 to"),
-        (lambda: LookingReader(width="8"), "LookingReader: width: expected int, got '8'"),
+        (lambda: LookingReader(width="8"), "LookingReader.width: expected int, got '8'"),
         (
             lambda: vary(CONFIG, {"architecture.reader.parent": None}),
             r"reader\.parent: .* no such field; did you mean",

@@ -140,6 +140,7 @@ BOMB = (1 << 40, 2)
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(1, 1))}}, "1 axes and 2 strides"),
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=BOMB, strides=(0, 1))}}, "does not fit"),
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=("a",), strides=(1,))}}, "no counts"),
+        ({"model": dict.fromkeys("abcdefghi", FakeTensor(np.zeros(9999, np.float32)))}, "take more than 4 times the size"),
     ],
 )
 @FORMATS
