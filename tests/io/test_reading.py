@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from humangs_jax.io import reading as module
 from humangs_jax.io.arrays import read_npz
+from humangs_jax.io.mesh import GREY, read_meshes
 from humangs_jax.io.reading import (
     FileError,
     Limits,
@@ -218,3 +220,17 @@ def test_threads_parse_one_header_at_a_time(tmp_path, monkeypatch):
         assert not pickled
         for name, array in arrays.items():
             np.testing.assert_array_equal(read[name], array)
+
+
+def test_textures_outside_of_the_folder_of_a_mesh_are_left_out(tmp_path, caplog):
+    folder = tmp_path / "me"
+    folder.mkdir()
+    for place in (tmp_path, folder):
+        Image.new("RGB", (4, 4), "red").save(place / "red.png")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    (folder / "scan.obj").write_text(f"mtllib scan.mtl\nusemtl skin\n{corners}")
+    for texture, color in {"red.png": [255, 0, 0, 255], "../red.png": [GREY, GREY, GREY, 255]}.items():
+        (folder / "scan.mtl").write_text(f"newmtl skin\nmap_Kd {texture}\n")
+        (mesh,) = read_meshes(folder / "scan.obj", colors=True)
+        assert (mesh.visual.vertex_colors == color).all()
+    assert "'../red.png' lies outside of" in caplog.text
