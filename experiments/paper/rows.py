@@ -11,7 +11,7 @@ from experiments.paper.bench import animatable, folder_of, last_weights, shown, 
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
-from humangs_jax.evaluation.cases import Case, choose_views, find_people
+from humangs_jax.evaluation.cases import Case, Choice, choose_views, find_people
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.evaluation.scores import mean_scores, person_means
 from humangs_jax.io.reading import read_json
@@ -86,7 +86,7 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
     for name, (frames, poses) in zip(names, given, strict=True):
         context, target = varied(np.asarray(frames), photos) if varying else ([], [])
         if not target:
-            context, target = choose_views(name, np.asarray(frames), np.asarray(poses), photos)
+            context, target = choose_views(name, np.asarray(frames), np.asarray(poses), Choice(photos))
         found[name] = {"context": context, "target": target}
     return found
 

@@ -48,6 +48,17 @@ class Case:
     inputs: Capture | None = None
 
 
+class Choice(NamedTuple):
+    """Which views are inputs: see `find_people`."""
+
+    inputs: int | None = None
+    indices: Indices | None = None
+    reconstructs: bool = True
+
+
+ANY = Choice()
+
+
 class People(NamedTuple):
     """Cases by name, each loaded when it is asked for."""
 
@@ -93,19 +104,18 @@ def find_people(
     """
     if isinstance(source, Case):
         return People((source.name,), lambda index: source)
+    choice = Choice(inputs, indices, reconstructs)
     if isinstance(source, Capture):
-        return People(("capture",), lambda index: _split("capture", source, inputs, indices, reconstructs))
+        return People(("capture",), lambda index: _split("capture", source, choice))
     if isinstance(source, str | Path):
         path = capture_folder(source)
         if not (path / "capture.json").is_file() and not any(path.glob("*/capture.json")):
-            return _find_in_data_set(path, inputs, indices, body, reconstructs)
-        body = _model(body)
-        folders = find_captures(path)
+            return _find_in_data_set(path, choice, body)
+        body, folders = _model(body), find_captures(path)
         names = tuple(folder.name for folder in folders)
         if indices is not None and (unknown := [name for name in indices if name not in names]):
             raise ValueError(f"indices: {unknown[0]!r} is no capture in {source}")
-        load = lambda index: _load(folders[index], inputs, indices, body, reconstructs)
-        return People(names, load)
+        return People(names, lambda index: _load(folders[index], choice, body))
     if isinstance(source, Source):
         names = tuple(f"{index:04d}" for index in range(len(source)))
         return People(names, lambda index: _from_source(source, index, names[index], inputs, _model(body)))
@@ -115,12 +125,12 @@ def find_people(
     return People(tuple(case.name for case in cases), cases.__getitem__)
 
 
-def _load(folder: Path, inputs: int | None, indices: Indices | None, body: BodyModel | None, reconstructs: bool) -> Case:
+def _load(folder: Path, choice: Choice, body: BodyModel | None) -> Case:
     capture, held_out = load_capture(folder, body=body), folder / HELD_OUT
-    if indices is not None or not (held_out / "capture.json").is_file():
-        return _split(folder.name, capture, inputs, indices, reconstructs)
+    if choice.indices is not None or not (held_out / "capture.json").is_file():
+        return _split(folder.name, capture, choice)
     first = int(np.sum(np.asarray(capture.frames) == capture.frames[0]))
-    count = min(DEFAULT_INPUTS, first) if inputs is None else inputs
+    count = min(DEFAULT_INPUTS, first) if choice.inputs is None else choice.inputs
     chosen = spread_views(folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count)
     return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
 
@@ -129,9 +139,7 @@ def _model(body: BodyModel | str | Path | None) -> BodyModel | None:
     return load_body(body) if isinstance(body, str | Path) else body
 
 
-def _find_in_data_set(
-    path: Path, inputs: int | None, indices: Indices | None, body: BodyModel | str | Path | None, reconstructs: bool
-) -> People:
+def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path | None) -> People:
     """The people of a data set; photos are read when a case is loaded."""
     file_body = FileBody(body) if isinstance(body, BodyModel) else FileBody.load(body)
     people = open_people(path, file_body)
@@ -139,10 +147,9 @@ def _find_in_data_set(
 
     def load(index: int) -> Case:
         subject, size, name = people[index].subject, people[index].size, names[index]
-        chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, inputs, indices, reconstructs)
+        chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, choice)
         if len(targets) > MOST_TARGETS:
-            problem = f"{len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
-            raise ValueError(f"{name}: {problem}")
+            raise ValueError(f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices")
         seen = subject.capture(chosen, file_body, size) if chosen else None
         return Case(name, subject.capture(targets, file_body, size), seen)
 
@@ -158,26 +165,17 @@ def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(f"{index:04d}" for index in range(len(paths)))
 
 
-def _split(name: str, capture: Capture, inputs: int | None, indices: Indices | None, reconstructs: bool) -> Case:
+def _split(name: str, capture: Capture, choice: Choice) -> Case:
     """Inputs and targets of one capture."""
-    cam_from_world = np.asarray(capture.cameras.cam_from_world)
-    chosen, targets = choose_views(name, capture.frames, cam_from_world, inputs, indices, reconstructs)
+    chosen, targets = choose_views(name, capture.frames, np.asarray(capture.cameras.cam_from_world), choice)
     return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
 
 
 def choose_views(
-    name: str,
-    frames: Int[np.ndarray, " v"],
-    cam_from_world: Float[np.ndarray, "v 4 4"],
-    inputs: int | None = None,
-    indices: Indices | None = None,
-    reconstructs: bool = True,
+    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], choice: Choice = ANY
 ) -> tuple[list[int], list[int]]:
-    """The views of a person that are inputs, and those to compare with; see `find_people`.
-
-    Raises: ValueError naming the person.
-    """
-    count = len(frames)
+    """The views of a person that are inputs, and those to compare with. Raises: ValueError naming the person."""
+    count, (inputs, indices, reconstructs) = len(frames), choice
     if indices is not None:
         if name not in indices:
             raise ValueError(f"indices: {name!r} is missing")

@@ -18,7 +18,7 @@ MILLIMETRES = 4e-3
 
 @pytest.fixture(scope="module")
 def people(body):
-    return [describe(DEMO[i], body) for i in range(400)]
+    return [describe(DEMO[i], body) for i in range(150)]  # the first 148 wear everything that there is
 
 
 def test_people_are_as_tall_as_they_are_described(body, people):
@@ -45,15 +45,11 @@ def test_people_differ(people):
 
 def test_clothes_go_together(people):
     for person in people:
-        kinds = [g.kind for g in person.garments]
-        dressed = [k for k in kinds if k in outfits.DRESSES]
-        assert len(dressed) + len([k for k in kinds if k in outfits.TOPS]) >= 1
-        assert len(dressed) + len([k for k in kinds if k in outfits.BOTTOMS + outfits.SKIRTS]) == 1
-        assert len([k for k in kinds if k in outfits.SHOES]) == 1
-        assert len([k for k in kinds if k in outfits.HEADWEAR]) <= 1
-        assert len([k for k in kinds if k in outfits.OUTER]) <= 1
-        if person.male:
-            assert not set(kinds) & set(outfits.DRESSES + outfits.SKIRTS)
+        count = lambda kinds, person=person: sum(garment.kind in kinds for garment in person.garments)
+        assert count(outfits.DRESSES + outfits.TOPS) >= 1
+        assert count(outfits.DRESSES + outfits.BOTTOMS + outfits.SKIRTS) == count(outfits.SHOES) == 1
+        assert count(outfits.HEADWEAR) <= 1 and count(outfits.OUTER) <= 1
+        assert not (person.male and count(outfits.DRESSES + outfits.SKIRTS))
 
 
 @pytest.mark.slow
@@ -109,13 +105,11 @@ def test_emblems_are_closed_shapes(kind):
 
 
 def test_a_chest_print_faces_the_viewer_and_a_sleeve_has_its_own_coordinates():
-    cloth = np.asarray([[0.05, 0.0, 0.1, TRUNK_GIRTH]] * 2, np.float32)
     template = np.asarray([[0.05, 0.0, 0.12], [ARMHOLE + 0.1, 0.1, 0.0]], np.float32)
-    spots = Spots(cloth, template)
+    spots = Spots(np.asarray([[0.05, 0.0, 0.1, TRUNK_GIRTH]] * 2, np.float32), template)
     assert spots.around[0] > 0  # the viewer's right is the person's left
     np.testing.assert_allclose(spots.cloth[:, 3], [TRUNK_GIRTH, ARM_GIRTH])
-    again = Spots(spots.cloth, template)
-    np.testing.assert_array_equal(again.cloth, spots.cloth)
+    np.testing.assert_array_equal(Spots(spots.cloth, template).cloth, spots.cloth)
 
 
 @pytest.mark.slow

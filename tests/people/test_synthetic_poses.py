@@ -63,15 +63,11 @@ def test_all_joints_stay_within_their_limits(drawn):
     assert (angles.std(0)[kin.LEFT_HAND :] > 0.01).all()  # and every joint of the hands
 
 
-def test_knees_and_elbows_bend_one_way(drawn):
+def test_knees_elbows_and_fingers_bend_one_way(drawn):
     assert (drawn[:, [kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] >= -0.03).all()  # rest knees are not quite straight
     assert (drawn[:, kin.LEFT_ELBOW, 1] < 0).all() and (drawn[:, kin.RIGHT_ELBOW, 1] > 0).all()
-
-
-def test_fingers_bend_towards_the_palm(drawn):
-    first = {0: kin.LEFT_HAND, 1: kin.RIGHT_HAND}
-    for side, sign in ((0, -1), (1, 1)):
-        bends = sign * drawn[:, first[side] : first[side] + 12, 2]
+    for first, sign in ((kin.LEFT_HAND, -1), (kin.RIGHT_HAND, 1)):
+        bends = sign * drawn[:, first : first + 12, 2]  # towards the palm
         assert bends.min() > -0.12 and bends.max() > 1.0 and np.median(bends) > 0.1
 
 

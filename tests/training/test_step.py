@@ -112,12 +112,9 @@ def test_parameters_of_fewer_bits_are_refused(body, source):
 def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source, variables):
     keys = jax.random.split(jax.random.key(0), 2)
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
-    gradients = lambda batch, keys, config=CONFIG: batch_gradients(
-        variables["params"], variables["batch_stats"], body, batch, keys, config
-    )
-    one = lambda i: gradients(jax.tree.map(lambda x: x[i : i + 1], batch), keys[i : i + 1])
-    both = gradients(batch, keys)
-    singles = [one(0), one(1)]
+    gradients = functools.partial(batch_gradients, variables["params"], variables["batch_stats"], body)
+    singles = [gradients(jax.tree.map(lambda x, i=i: x[i : i + 1], batch), keys[i : i + 1], CONFIG) for i in (0, 1)]
+    both = gradients(batch, keys, CONFIG)
     for position in (0, 1, 2):  # loss, gradients, batch statistics
         mean = jax.tree.map(lambda a, b: (a + b) / 2, *(x[position] for x in singles))
         close = jax.tree.map(lambda a, b: np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9, both[position], mean)
