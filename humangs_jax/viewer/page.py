@@ -122,13 +122,6 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
     return _joined(header, arrays)
 
 
-def unpack(packed: Packed) -> dict[str, np.ndarray]:
-    """The arrays by name, as the page reads them."""
-    entries = packed.header["arrays"].items()
-    read = lambda e: np.frombuffer(packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]).reshape(e["shape"])
-    return {name: read(entry) for name, entry in entries}
-
-
 def _low_pass(avatar: Avatar) -> float:
     """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
     return 0.0 if avatar.gaussians.low_pass is None else float(np.median(avatar.gaussians.low_pass))

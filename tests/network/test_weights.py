@@ -1,5 +1,4 @@
 import dataclasses
-import functools
 import json
 import os
 
@@ -14,10 +13,8 @@ from humangs_jax.network import presets, weights
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.weights import load_weights, save_weights
 
-ENCODER, READER, DECODER = paper_parts(TINY.architecture)
+ENCODER, _, _ = paper_parts(TINY.architecture)
 VARIABLES = random_variables(TINY)
-NO_RGB = dataclasses.replace(READER, sample_rgb=False)
-encoder = functools.partial(dataclasses.replace, ENCODER)
 TEXTURE = "params/encoder/tokenizer/texture"
 
 

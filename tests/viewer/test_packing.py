@@ -23,9 +23,16 @@ HALF = 0.5 * (1 + 1e-6)
 """A rounded number is half a step off at most; the rest is for rounding in float64."""
 
 
+def unpack(packed):
+    """The arrays by name, as the page reads them."""
+    entries = packed.header["arrays"].items()
+    read = lambda e: np.frombuffer(packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]).reshape(e["shape"])
+    return {name: read(entry) for name, entry in entries}
+
+
 def decoded(packed):
     """What the page makes of the arrays: dequantized as scene.js and project.frag do."""
-    arrays, header = packing.unpack(packed), packed.header
+    arrays, header = unpack(packed), packed.header
     spread = lambda name: (
         np.asarray(header[name]["low"])
         + arrays[name] * STEP * (np.asarray(header[name]["high"]) - np.asarray(header[name]["low"]))
@@ -62,7 +69,7 @@ def test_harmonics_are_kept():
     gaussians = replace(avatar.gaussians, harmonics=jnp.asarray(harmonics, jnp.float32))
     packed = packing.pack(replace(avatar, gaussians=gaussians))
     low, high = packed.header["harmonics"]["low"], packed.header["harmonics"]["high"]
-    got = low + packing.unpack(packed)["harmonics"] * STEP * (high - low)
+    got = low + unpack(packed)["harmonics"] * STEP * (high - low)
     assert got.shape == harmonics.shape and np.abs(got - harmonics).max() <= HALF * STEP * (high - low) + 1e-6
 
 
@@ -72,7 +79,7 @@ def test_the_light_is_kept():
     numbers = (rng.normal(size=8), normals / np.linalg.norm(normals, axis=1, keepdims=True), rng.normal(size=len(normals)))
     light = Light(*(jnp.asarray(x, jnp.float32) for x in numbers))
     packed = packing.pack(replace(avatar, light=light))
-    arrays, header = packing.unpack(packed), packed.header
+    arrays, header = unpack(packed), packed.header
     low, high = header["light_shading"]["low"], header["light_shading"]["high"]
     assert header["light"] == [float(x) for x in light.coefficients]
     assert np.abs(arrays["light_normals"] / 127 - np.asarray(light.normals)).max() <= HALF / 127
@@ -115,7 +122,7 @@ def test_a_motion_is_kept_to_a_ten_thousandth_of_a_radian():
     rng = np.random.default_rng(0)
     motion = Motion(jnp.asarray(rng.uniform(-3, 3, (5, 3, 3)), jnp.float32), jnp.asarray(rng.normal(size=(5, 3)), jnp.float32))
     packed = packing.pack(small_avatar(), motion)
-    arrays, about = packing.unpack(packed), packed.header["motion"]
+    arrays, about = unpack(packed), packed.header["motion"]
     assert about["frames"] == 5 and about["fps"] == 30
     np.testing.assert_allclose(arrays["rotations"] * about["step"], motion.rotations, atol=1e-4)
     np.testing.assert_array_equal(arrays["translations"], motion.translations)
@@ -124,7 +131,7 @@ def test_a_motion_is_kept_to_a_ten_thousandth_of_a_radian():
 def test_the_shape_is_found_and_its_directions_move_vertices_and_joints():
     avatar, body = small_avatar(betas=(0.3, -1.2)), small_body()
     packed = packing.pack(avatar, body=body)
-    arrays, about = packing.unpack(packed), packed.header["shape"]
+    arrays, about = unpack(packed), packed.header["shape"]
     np.testing.assert_allclose(about["betas"], [0.3, -1.2], atol=1e-4)
     assert list(about["names"]) == ["wide", "tall"]
     other = np.asarray([1.0, 0.5])
