@@ -305,51 +305,32 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
-def write_found(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
+def write_found(
+    folder: Path, photos: Sequence[PhotoPeople], person: int, *, masks: bool = True, to_capture: bool = False
+) -> None:
     """Keypoints and masks of a person, and the sheet, into a folder; all or nothing.
 
+    Arguments: to_capture: the folder is the capture whose photos these are, which then names the masks.
     Raises: ValueError if two photos have the same name but for the suffix.
     """
-    files = [mask_file(Path(), photo.name) for photo in photos]
+    files = [f"{MASKS}/{Path(photo.name).with_suffix('.png').as_posix()}" for photo in photos]
     if several := [photo.name for photo, file in zip(photos, files, strict=True) if files.count(file) > 1]:
         raise ValueError(f"{' and '.join(several)}: masks would have one name: rename all but one")
 
     def write(temporary: Path) -> None:
-        _write_people(temporary, photos, person)
-        for photo, file in zip(photos, files, strict=True):
+        shown = [(photo, photo.people[person]) for photo in photos]
+        images = [ImagePeople(photo.name, photo.size, (None if each is None else each.person,)) for photo, each in shown]
+        write_people(temporary / KEYPOINTS_FILE, images)
+        write_sheet(temporary / SHEET_FILE, photos, person)
+        for photo, file in zip(photos, files, strict=True) if masks else ():
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
             write_png(temporary / file, person_mask(photo, person))
-
-    add_files(folder, write)
-
-
-def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, masks: bool) -> None:
-    """Keypoints and the sheet into the capture folder whose photos these are; masks: the masks, too."""
-    description = read_description(folder / "capture.json")
-    files = [mask_file(Path(), photo.name).as_posix() for photo in photos]
-    views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
-
-    def write(temporary: Path) -> None:
-        _write_people(temporary, photos, person)
-        if masks:
-            (temporary / MASKS).mkdir()
-            for photo, file in zip(photos, files, strict=True):
-                write_png(temporary / file, person_mask(photo, person))
+        if masks and to_capture:
+            description = read_description(folder / "capture.json")
+            views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
             write_json(temporary / "capture.json", description | {"views": views})
 
     add_files(folder, write)
-
-
-def _write_people(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
-    shown = [(photo, photo.people[person]) for photo in photos]
-    images = [ImagePeople(photo.name, photo.size, (None if each is None else each.person,)) for photo, each in shown]
-    write_people(folder / KEYPOINTS_FILE, images)
-    write_sheet(folder / SHEET_FILE, photos, person)
-
-
-def mask_file(folder: Path, name: str) -> Path:
-    """Where the mask of a photo is."""
-    return folder / MASKS / Path(name).with_suffix(".png")
 
 
 def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:

@@ -122,7 +122,7 @@ def _written(
             people[number] = detect.exchanged(person)
         name, size = f"{Path(described['image']).stem}.png", (report.width, report.height)  # padded
         written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
-    detect.add_to_capture(out, written, number, masks=own_masks)
+    detect.write_found(out, written, number, masks=own_masks, to_capture=True)
     warnings = (*found.warnings, *report.warnings)
     return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(written))
 

@@ -51,7 +51,7 @@ def found_here(capture: Path, person: int | None) -> Path:
     photos = load_photos(folder)
     if not file.exists() or person is not None or photos.masks is None:
         people, number = detect.person_in_capture(folder, photos, person=person)
-        detect.add_to_capture(folder, people, number, masks=photos.masks is None)
+        detect.write_found(folder, people, number, masks=photos.masks is None, to_capture=True)
         tell_found(people, number)
         what = "keypoints" if photos.masks is not None else "keypoints and masks"
         tell(f"{what} found in the photos: {folder / detect.SHEET_FILE} shows them")

@@ -159,7 +159,7 @@ class Start:
             given = keypoints_of(photos, material.keypoints, self.person)
             people, person = detect.person_in_capture(self.out, photos, given, self.person)
         with stage("writing what was found"):
-            detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
+            detect.write_found(self.out, people, person, masks="masks" in wanted, to_capture=True)
         tell_found(people, person)
         tell(f"{' and '.join(wanted)} found in the photos: {self.out / detect.SHEET_FILE} shows them")
         return self._with_found(material, "masks" in wanted)

@@ -180,10 +180,7 @@ def read_photos(
     file, views = folder / "capture.json", description["views"]
     if poses is None:
         frames = [expect(view.get("frame", 0), int, file, f"views[{i}].frame") for i, view in enumerate(views)]
-        if min(frames) < 0:
-            field = f"views[{frames.index(min(frames))}].frame"
-            raise CaptureError(file, field, f"expected an integer of at least 0, got {shown(min(frames))}")
-        poses = 1 + max(frames)
+        poses = 1 + max(0, *frames)
         with reading(file, "capture", CaptureError):
             check_limit("frames", poses, "frames")
             check_limit("frames_per_photo", math.ceil(poses / len(views)), f"frames for each of {len(views)} photos")
