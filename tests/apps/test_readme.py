@@ -1,6 +1,7 @@
 """The Python of README.md and of the pages, executed as it stands: with what a page takes for given, on small inputs."""
 
 import dataclasses
+import json
 import pickle
 import re
 import shutil
@@ -115,11 +116,24 @@ def files(tmp_path, monkeypatch, body):
     return tmp_path
 
 
+def check_described_capture(text):
+    """The lines of Python wrote a capture whose capture.json has the keys of the one that is described, and its camera."""
+    capture, file = hg.load_capture("me"), Path("me/capture.json")
+    assert capture.view_count == 4 and capture.body.name == "makehuman"
+    written, content = json.loads(file.read_text()), json.loads(re.search(r"```json\n(.*?)```", text, re.DOTALL)[1])
+    assert set(content) == set(written) and set(content["views"][0]) == set(written["views"][0])
+    for key in ("image", "mask"):
+        shutil.copyfile(f"me/{written['views'][0][key]}", f"me/{content['views'][0][key]}")
+    file.write_text(json.dumps(content))
+    np.testing.assert_array_equal(hg.load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0])
+    np.testing.assert_allclose(capture.cameras.center[0], [0, 0.9, 2.6], atol=1e-6)  # 2.6 m in front, 0.9 m above the ground
+
+
 @pytest.mark.parametrize("page", ON_FILES)
 def test_the_blocks_of_a_page_on_files_run(page, files):
     names = run(page, MODULES | {"avatar": Avatar.load("tiny.npz")})
     if page == "docs/capture_format.md":
-        assert hg.load_capture("me").view_count == 4
+        check_described_capture((ROOT / page).read_text())
     if page == "docs/motions.md":
         assert len(names["motion"].translations) == 3
 
