@@ -22,6 +22,7 @@ from scipy import ndimage
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
+from humangs_jax.data.calibration.calibration import distort
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import person_box
@@ -114,12 +115,7 @@ class VideoCamera(NamedTuple):
     def distorted(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Where the video shows what a pinhole would show at these pixels."""
         focal, middle = self.K[[0, 1], [0, 1]], self.K[:2, 2]
-        x, y = np.moveaxis((pixels - middle) / focal, -1, 0)
-        k1, k2, p1, p2 = self.distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + k2 * r2)
-        bent = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
-        return np.stack(bent, axis=-1) * focal + middle
+        return distort((pixels - middle) / focal, np.append(self.distortion, 0.0)) * focal + middle
 
     def undistorted(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """The inverse, by iteration: the distortion is some pixels."""
