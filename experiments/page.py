@@ -36,6 +36,10 @@ SHOWN = (
     ("foreground PSNR, dB", "person"),
     ("after 100 frames of motion, dB", "motion_whole"),
     ("foreground PSNR, dB", "motion_person"),
+    ("size of the page, MB", "bytes"),
+    ("first image after, s", "first_image_seconds"),
+    ("frames per second, {size} px, software WebGL", "fps"),
+    ("one sort by depth, ms", "sort_ms"),
 )
 
 
@@ -59,11 +63,8 @@ def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20
     with tempfile.TemporaryDirectory() as folder:
         rows = [_measured(each, Path(folder) / f"{name}.html", size, frames) for name, each in avatars.items()]
     header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
-    lines = [[label, *(f"{row[key]:.1f}" for row in rows)] for label, key in SHOWN]
-    lines.append(["size of the page, MB", *(f"{row['bytes'] / 1e6:.2f}" for row in rows)])
-    lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
-    lines.append([f"frames per second, {size} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
-    lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
+    show = lambda row, key: f"{row[key] / 1e6:.2f}" if key == "bytes" else f"{row[key]:.1f}"
+    lines = [[label.format(size=size), *(show(row, key) for row in rows)] for label, key in SHOWN]
     run.show(markdown_table(header, lines), {"size": size} | dict(zip(avatars, rows, strict=True)))
 
 
@@ -83,25 +84,16 @@ def _measured(avatar, file, size, frames):
 
 def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyPose]]:
     """Three cameras and three poses; all look at the person in the pose."""
-    joints = len(avatar.parents)
-    poses = {
-        "T-pose": BodyPose(jnp.zeros((joints, 3)), jnp.zeros(3)),
-        "walk": load_motion().pose(WALK_FRAME),
-        "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0),
+    rotations = {
+        "T-pose": jnp.zeros((len(avatar.parents), 3)),
+        "walk": load_motion().pose(WALK_FRAME).rotations,
+        "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0).rotations,
     }
-    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
-    cameras = orbit(
-        jnp.asarray(avatar.rest_vertices.mean(0)),
-        1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV),
-        jnp.asarray(AZIMUTHS),
-        jnp.asarray(ELEVATIONS),
-        intrinsics_from_fov(VERTICAL_FOV, size, size),
-        size,
-        size,
-    )
+    height, middle = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1])), jnp.asarray(avatar.rest_vertices.mean(0))
+    distance, K = 1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV), intrinsics_from_fov(VERTICAL_FOV, size, size)
+    cameras = orbit(middle, distance, jnp.asarray(AZIMUTHS), jnp.asarray(ELEVATIONS), K, size, size)
     # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back there
-    poses = {name: BodyPose(pose.rotations, jnp.zeros(3)) for name, pose in poses.items()}
-    return [cameras[i] for i in range(len(AZIMUTHS))], poses
+    return [cameras[i] for i in range(len(AZIMUTHS))], {name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()}
 
 
 def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple[float, float]]:
