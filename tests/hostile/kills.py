@@ -1,4 +1,4 @@
-"""Kills every command that writes at random moments: python kills.py FOLDER [--count 10] [--json FILE] [COMMAND ...]
+"""Kills commands that write at random moments: python kills.py FOLDER [--count 10] [--json FILE] [COMMAND ...]
 Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts [--count 100] [--json FILE] [COMMAND ...]
 
 A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, or at any time. Then no file
