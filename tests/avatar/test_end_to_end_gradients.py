@@ -108,8 +108,6 @@ SLOW = [
     Case("small", "all", "all", remat=True, train=True, scan=True),
     *(Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")),
 ]
-SLOW += [Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")]
-
 
 pytestmark = pytest.mark.usefixtures("float64")
 

@@ -8,6 +8,7 @@ import pytest
 from safetensors.numpy import load_file
 from training_runs import losses, worker
 
+KILLS = 15
 WAIT_SECONDS = 300
 
 
@@ -37,13 +38,13 @@ def kill_in_a_checkpoint_write(arguments, out, delay):
     return newest
 
 
-def survive(kills, tmp_path, captures):
-    """Kill a run `kills` times, then let it end; compare with one that was never killed."""
+@pytest.mark.slow
+def test_killed_in_checkpoint_writes_a_run_ends_as_one_that_never_was(tmp_path, captures):
     options = ["--no-validation", "--batch", "1", "--cache", str(tmp_path / "compiled")]
     killed, whole, generator = tmp_path / "killed", tmp_path / "whole", random.Random(0)
     folder = str(captures[0].parent)
     done = 0
-    for _ in range(kills):
+    for _ in range(KILLS):
         newest = kill_in_a_checkpoint_write([str(killed), folder, *options], killed, generator.uniform(0, 0.05))
         assert newest > done, "a checkpoint was lost"
         done = newest
@@ -55,8 +56,3 @@ def survive(kills, tmp_path, captures):
     weights = load_file(whole / "weights.safetensors")
     assert all((tensor == weights[name]).all() for name, tensor in load_file(killed / "weights.safetensors").items())
     assert not list((killed / "checkpoints").glob("*tmp*"))
-
-
-@pytest.mark.slow
-def test_kill_in_a_checkpoint_write_fifty_times(tmp_path, captures):
-    survive(50, tmp_path, captures)
