@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from changes import edit_json
+from changes import edit_json, edit_text
 
 from humangs_jax.data.calibration.calibration import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
@@ -119,6 +119,9 @@ def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
     assert cameras["1"].distortion is None
     assert cameras["a_1"].distortion is not None and cameras["a_1"].distortion[0] == 0.2
     np.testing.assert_allclose(cameras["1"].cam_from_world[:3, :3], poses[0, :3, :3], atol=1e-6)
+    edit_text(tmp_path / "cams" / "extri.yml", "T_c:", "U_c:")
+    with pytest.raises(CaptureError, match=r"extri\.yml: T_c: missing"):
+        read_calibration(tmp_path / "cams", lambda name: (0, 0))
 
 
 def test_rotation_vectors_are_read_where_there_is_no_matrix(tmp_path):

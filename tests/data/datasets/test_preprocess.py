@@ -79,6 +79,8 @@ def test_a_video_becomes_a_scene_in_an_upright_world(videos, tmp_path, body):
     np.testing.assert_allclose((posed.vertices.min(0) + posed.vertices.max(0)) / 2, 0, atol=MILLIMETRE)
     before = next(posed_people(body.model, raw.parameters([1]))).vertices
     after = next(posed_people(body.model, found.parameters([1]))).vertices
+    with np.load(tmp_path / "out" / "avatarrex_a" / "smpl" / "000001.npz") as arrays:
+        np.testing.assert_allclose(arrays["v_posed"], after, atol=MILLIMETRE)
     for view, other in ((2, 2), (3, 3)):
         seen = [
             (subject.cam_from_world[i] @ np.concatenate([points, np.ones((len(points), 1))], 1).T)[:3]
