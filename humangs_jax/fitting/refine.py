@@ -78,9 +78,9 @@ class CaptureRefineConfig:
 
     std: how far off the start is expected to be. coefficients: of the shape, where the capture has fewer. fixed_cameras: only
     shape and poses move. iterations: number of matchings. points: of a silhouette. independent: number of independent equations
-    that all points of a view count for. robust_scales: multiples of the reach, outwards and inwards of the mask.
-    keypoints_worse: a result whose keypoints' error is more than this multiple of the
-    start's is not kept; a fit to them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    that all points of a view count for. robust_scales: multiples of the reach, outwards and inwards of the mask. keypoints_worse:
+    a result whose keypoints' error is more than this multiple of the start's is not kept; a fit to them made it small, right
+    results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
     """
 
     std: StateStd = dataclasses.field(default_factory=StateStd)

@@ -1,8 +1,8 @@
-"""Hostile files end in one line, in bounded memory and time, and nothing else happens; every command that writes loses nothing.
+"""Hostile files end in one line, in bounded memory and time, and nothing else happens; commands that write lose nothing.
 
 Some files of each item are read here, all of them in a process of their own (`worker`), by the slow tests. So are the commands:
 killed, and on full and read-only disks (`writers`). `python tests/hostile/test_hostile.py FOLDER` reads all files and
-prints the figures of docs/security.md.
+prints the figures of docs/benchmarks/security.md.
 """
 
 import json
