@@ -80,7 +80,8 @@ def test_a_camera_that_was_moved(good):
     capture, keypoints = good
     matrices = capture.cameras.cam_from_world.at[6, 0, 3].add(0.3)
     report = examine(dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=matrices)), keypoints).report
-    (warning,) = report.warnings
+    cause, warning = report.warnings
+    assert cause.startswith("camera m1v2 is off by ")
     assert warning.startswith("body and keypoints disagree in view m1v2: ") and f"warning: {warning}" in str(report)
     assert np.argmax([view.median for view in report.views]) == 6
 
