@@ -240,6 +240,7 @@ def run_all(lines, humangs):
         assert code == 0, f"{line}: {err}"
 
 
+@pytest.mark.slow
 def test_documented_exports_run(workspace, humangs):
     run_all(QUICK, humangs)
     made = {path.name for path in workspace.iterdir()}

@@ -47,6 +47,7 @@ def interrupted(program, number=signal.SIGINT):
     return program.communicate(timeout=250)
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     """As in a compilation: a long call into C, which gives Python no turn. What it was writing goes, too."""
     writing = """

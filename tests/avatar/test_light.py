@@ -89,6 +89,7 @@ def test_colors_have_the_mean_light_of_photos_in_several_poses(person):
     np.testing.assert_allclose(found.shading, sum(terms) / 2 @ found.coefficients, atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_bodies_of_one_brightness_have_no_light():
     avatar = two_balls(2)
     grey = replace(avatar, gaussians=replace(avatar.gaussians, colors=jnp.full_like(avatar.gaussians.colors, 0.4)))

@@ -40,6 +40,7 @@ def test_variances_grow_by_the_low_pass_and_back():
     assert back.gaussians.low_pass is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [render, render_reference])
 def test_renderers_add_what_the_scales_do_not_contain(draw):
     gaussians = skin(with_low_pass(two_balls(1), PIXEL), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))

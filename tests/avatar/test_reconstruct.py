@@ -197,6 +197,7 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
             np.testing.assert_allclose(got, expected, atol=100 * TURNED)
 
 
+@pytest.mark.slow
 def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, network):
     """As in the release: vertices are sampled where the whole body model puts them, Gaussians move by blend skinning alone."""
     _, config = network
@@ -212,6 +213,7 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
     np.testing.assert_array_equal(moved[0].means, moved[1].means)
 
 
+@pytest.mark.slow
 def test_light_shines_from_above_in_a_capture_of_another_world(body):
     """Drawing and fitting an avatar with light give the same in a capture whose z axis points up."""
     photos = capture(body, SIZE, SIZE)

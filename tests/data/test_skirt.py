@@ -81,6 +81,7 @@ def turned_hips(body, degrees):
     return jnp.asarray(rotations)
 
 
+@pytest.mark.slow
 def test_a_skirt_is_found_and_lies_on_the_masks(body, monkeypatch):
     hem = 0.65
     monkeypatch.setattr(skirt, "REACH", dataclasses.replace(skirt.REACH, inset=(0.0, 0.0)))

@@ -85,6 +85,7 @@ def test_a_small_person_in_a_large_photo(networks, demo):
     check(person, joints * 205 / 512 + (corner[1], corner[0]), scale * height, mask)
 
 
+@pytest.mark.slow
 def test_nobody_in_noise_and_in_the_dark(networks):
     noise = np.random.default_rng(0).uniform(size=(160, 160, 3)).astype(np.float32)
     assert detect_people(networks, noise) == []

@@ -58,6 +58,7 @@ def test_readme_times():
     assert rows[1] == "| animate: one pose | 2.1 s | 34 ms |" and rows[3].endswith("|  | 40 s |")
 
 
+@pytest.mark.slow
 def test_details_are_squares_around_the_joints():
     body = load_body()
     rest = shape_body(body, jnp.zeros(2))

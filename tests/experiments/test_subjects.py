@@ -10,6 +10,7 @@ from humangs_jax.people.subject import DEMO
 from humangs_jax.people.writer import Layout, write_person
 
 SIZE = 48
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

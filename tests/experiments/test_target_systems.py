@@ -131,6 +131,7 @@ def test_every_target_is_its_own_pass_and_the_order_of_photos_is_irrelevant(name
     close(alone, drawing(name)(variables, hidden, asked))
 
 
+@pytest.mark.slow
 def test_body_and_pose_change_nothing_of_lvsm_and_the_target_s_position_map_tells_humanram_the_pose():
     for name, differs in (("lvsm", False), ("humanram", True)):
         variables, inputs = random_variables(small(name)), inputs_of(name)
@@ -153,6 +154,7 @@ def test_targets_ask_by_rays_and_their_pose_and_their_photos_are_not_read():
     np.testing.assert_array_equal(ask(tube(), blank, config.with_conventions(pixels="person")), asked)
 
 
+@pytest.mark.slow
 def test_humanram_without_its_texture_and_convolutions_is_lvsm():
     config = small("humanram")
     config = config.with_parts(driver=dataclasses.replace(config.architecture.driver, fusion=None))
@@ -318,6 +320,7 @@ def stereo():
     return config, variables, inputs, jax.jit(lambda x: apply_humangs(variables, x, config)[0].scene)
 
 
+@pytest.mark.slow
 def test_a_pixel_s_gaussian_has_its_color_and_lies_on_its_ray_near_the_body():
     _, _, inputs, scene_of = stereo()
     inputs = replace(inputs, foreground=inputs.foreground.at[:, :4].set(False))

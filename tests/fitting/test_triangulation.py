@@ -232,7 +232,7 @@ def test_of_four_views_two_and_two():
     )
 
 
-@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("views", [3, pytest.param(8, marks=pytest.mark.slow)])
 def test_cameras_of_two_views(views):
     capture, keypoints = person(13, 4, views, outliers=0.1)
     order = np.arange(4 * views)

@@ -145,6 +145,7 @@ def test_the_numbers_and_gradients_of_torch(name, dtype):
     assert np.linalg.norm(np.asarray(gradient) - expected) < slopes * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_the_golden_numbers():
     """Of the project (golden perceptual_a)."""
     golden, vgg = np.load(DATA / "perceptual_a.npz"), made_up("vgg19")

@@ -189,6 +189,7 @@ def test_weights_are_read_as_written(tmp_path, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, learned.load_refiner.__wrapped__(), changed)
 
 
+@pytest.mark.slow
 def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_fit(scene, monkeypatch):
     avatar, photo, parameters, splat = scene
     looked, signals = [], learned.photo_signals
@@ -200,6 +201,7 @@ def test_iterations_look_at_a_few_evenly_spaced_photos_and_count_what_does_not_f
     assert looked == [id(photos[i]) for i in (0, 1, 3, 4, 6, 7)]
 
 
+@pytest.mark.slow
 def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, body, monkeypatch):
     """A Gaussian that is hidden at the start and seen after the iterations gets trust."""
     gaussians = scene[0].gaussians

@@ -78,7 +78,8 @@ def squared_error(avatar, capture):
     return float(np.mean(np.square(np.clip(drawn, 0, 1) - capture.images)))
 
 
-@pytest.mark.parametrize("times", [1 / 3, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1 / 3, 3])
 def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     """Also if its low-pass is that of smaller or larger pixels than theirs."""
     avatar, capture = person
@@ -97,6 +98,7 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     np.testing.assert_allclose(squared_error(views_alone, capture), errors[0], rtol=0.01)  # dimmed, as above
 
 
+@pytest.mark.slow
 def test_photos_from_near_and_far_are_fitted_together(body, person):
     """The far ones have larger pixels, which do not blur what the near one shows."""
     avatar, _ = person

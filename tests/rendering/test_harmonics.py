@@ -93,6 +93,7 @@ def gradients(draw, gaussians, view):
     return jax.jit(jax.grad(loss, argnums=(0, 1)))(gaussians, view.cam_from_world)
 
 
+@pytest.mark.slow
 def test_gradients_in_float32_are_those_of_the_reference_in_float64():
     gaussians = with_harmonics(random_gaussians(5, np.float32), 15)
     gaussians = replace(gaussians, means=gaussians.means.at[9:11, 2].set(3.0))  # none at the near plane

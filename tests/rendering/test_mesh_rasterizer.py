@@ -159,6 +159,7 @@ def test_strong_perspective_equals_rays():
     check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
 
 
+@pytest.mark.slow
 def test_float64():
     with jax.enable_x64(True):
         vertices, faces = sphere()
