@@ -117,6 +117,7 @@ def test_dimmed_splats_are_drawn_as_defined():
     assert jnp.abs(render(undimmed, camera).alpha - drawn.alpha).max() > 0.05
 
 
+@pytest.mark.slow
 def test_dimming_is_differentiable_at_any_size(float64):
     """Needles, points without extent, and footprints that overflow."""
     camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 32, 32), 32, 32)[0]

@@ -176,6 +176,7 @@ def test_a_photo_on_white_is_the_same_person_on_black():
     np.testing.assert_allclose(found, color * mask, atol=1e-6)  # of float32
 
 
+@pytest.mark.slow
 def test_images_of_other_sizes_share_the_programs():
     """Crops of one bucket, as of many people, compile once."""
     rng = np.random.default_rng(0)

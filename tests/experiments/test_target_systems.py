@@ -335,6 +335,7 @@ def test_a_pixel_s_gaussian_has_its_color_and_lies_on_its_ray_near_the_body():
         assert np.min(depths) > 1.5 and np.max(depths) < 4.5 and np.ptp(depths) > 0.01
 
 
+@pytest.mark.slow
 def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
     _, _, inputs, scene_of = stereo()
     scene, centers = scene_of(inputs), inputs.cameras.center  # at 0, 1.67, 3.33 and 5 radians

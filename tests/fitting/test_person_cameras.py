@@ -54,6 +54,7 @@ def test_noise_of_a_detector(seed):
     assert found.moments == 1 and angles.mean() < NOISY_DEGREES and centers.mean() < NOISY_METRES
 
 
+@pytest.mark.slow
 def test_the_height_sets_the_scale():
     matrices, seen = cameras_around(3), seen_by(posed(), cameras_around(3), size=0.9)
     found = {height: cameras_from_person(seen, height=height) for height in (None, 1.5, 1.8)}

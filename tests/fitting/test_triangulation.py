@@ -264,6 +264,7 @@ def test_cameras_that_stand_still_are_reported_once():
     assert (swap.kind, swap.views, swap.frames) == ("cameras", ("m1v1", "m1v2"), 1)
 
 
+@pytest.mark.slow
 def test_both_at_once():
     capture, keypoints = person(17, 4, 8)
     order = np.arange(32)

@@ -156,6 +156,7 @@ def test_the_golden_numbers():
     np.testing.assert_allclose(losses.mean(), golden["total"], rtol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_the_loss_of_vgg16_against_its_definition():
     """Convolutions and pools by numpy, in float64."""
     predicted, target = image_pair(16, 19)

@@ -227,7 +227,7 @@ def worse(parameters, *_):
     return replace(parameters, means=parameters.means + 0.3), jnp.zeros((), int)
 
 
-@pytest.mark.parametrize(("update", "steps"), [(interrupted, 0), (worse, 0), (worse, 1)])
+@pytest.mark.parametrize(("update", "steps"), [pytest.param(interrupted, 0, marks=pytest.mark.slow), (worse, 0), (worse, 1)])
 def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(update, steps, scene, body, monkeypatch):
     monkeypatch.setattr(search, "learned_update", update)
     config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)
