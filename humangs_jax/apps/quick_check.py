@@ -114,7 +114,8 @@ class _View(NamedTuple):
 
 
 def _coarse_views(capture: Capture) -> list[_View]:
-    points, translations = surface_points(capture, POINTS), np.asarray(capture.poses.translation, float)
+    points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, POINTS)
+    translations = np.asarray(capture.poses.translation, float)
     K, matrices = np.asarray(capture.cameras.K, float), np.asarray(capture.cameras.cam_from_world, float)
     views = []
     for i, frame in enumerate(capture.frames.tolist()):

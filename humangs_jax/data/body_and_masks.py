@@ -24,7 +24,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.model import BodyModel
+from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -69,7 +69,7 @@ def unusable_views(capture: Capture) -> dict[int, str]:
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
         return found
-    points = surface_points(capture, POINTS)
+    points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, POINTS)
     K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
     for i, frame in enumerate(capture.frames.tolist()):
         mask = np.asarray(capture.masks[i])
@@ -89,33 +89,35 @@ def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
 # Points on the skin ---------------------------------------------------------------------------------------------------
 
 
-def surface_points(capture: Capture, count: int) -> dict[int, Float[np.ndarray, "count 3"]]:
+def surface_points(
+    body: BodyModel, betas: Float[np.ndarray, " s"], poses: BodyPose, frames: Int[np.ndarray, " v"], count: int
+) -> dict[int, Float[np.ndarray, "count 3"]]:
     """Points spread evenly over the skin, metres, by the frames that views show; without pose correctives."""
-    body, rest = capture.body, shaped(capture.body, capture)
+    rest = shaped(body, betas)
     joints = np.asarray(body.joint_regressor) @ rest
     corners, weights = _sampling(rest, np.asarray(body.faces), count)
     used, corners = np.unique(corners, return_inverse=True)
     skinning, corners = np.asarray(body.skinning_weights)[used], corners.reshape(weights.shape)
     posed = {}
-    for frame in set(capture.frames.tolist()):
-        linear, offset = skinned(body, joints, capture, frame, skinning)
+    for frame in set(frames.tolist()):
+        linear, offset = skinned(body, joints, poses, frame, skinning)
         vertices = np.einsum("nrc,nc->nr", linear, rest[used]) + offset
         posed[frame] = np.einsum("pc,pcx->px", weights, vertices[corners])
     return posed
 
 
 def skinned(
-    body: BodyModel, joints: Float[np.ndarray, "j 3"], capture: Capture, frame: int, weights: Float[np.ndarray, "n j"]
+    body: BodyModel, joints: Float[np.ndarray, "j 3"], poses: BodyPose, frame: int, weights: Float[np.ndarray, "n j"]
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights. joints: of the rest pose."""
-    turns = Rotation.from_rotvec(np.asarray(capture.poses.rotations[frame], float)).as_matrix()
+    turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
     moves = np.zeros((len(joints), 3, 4))
     for j, parent in enumerate(body.parents):  # parents come first
         turn = turns[j] if parent < 0 else moves[parent, :, :3] @ turns[j]
         place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
         moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
     blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-    return blended[..., :3], blended[..., 3] + np.asarray(capture.poses.translation[frame], float)
+    return blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
 
 
 def points_in_image(
@@ -228,7 +230,7 @@ def displacement(
     Where masks say nothing, or nothing of the body is near them, it is 0.
     """
     assert capture.masks is not None
-    rest = shaped(body, capture)
+    rest = shaped(body, capture.betas)
     views = masked_views(body, rest, capture)
     total = np.zeros_like(rest)
     if not views:
@@ -256,10 +258,11 @@ def to_edges(views: list[MaskedView], rest: Points, faces: Faces, held: PerVerte
     return total
 
 
-def shaped(body: BodyModel, capture: Capture) -> Points:
+def shaped(body: BodyModel, betas: Float[np.ndarray, " s"]) -> Points:
     """The vertices of the person's body in the T-pose."""
-    betas = np.asarray(capture.betas, float)
-    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
+    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ np.asarray(
+        betas, float
+    )
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
@@ -273,7 +276,7 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
         if i in unusable:
             continue
         if frame not in posed:
-            linear, offset = skinned(body, joints, capture, frame, weights)
+            linear, offset = skinned(body, joints, capture.poses, frame, weights)
             if body.pose_directions is not None:
                 turns = Rotation.from_rotvec(np.asarray(capture.poses.rotations[frame], float)).as_matrix()
                 correction = np.asarray(body.pose_directions) @ (turns[1:] - np.eye(3)).ravel()

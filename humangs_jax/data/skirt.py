@@ -60,7 +60,7 @@ def with_skirt(
     if hem is None:
         return None
     worn, count = with_tube(body, hem), len(body.template)
-    rest, faces = shaped(worn, capture), np.asarray(worn.faces)
+    rest, faces = shaped(worn, capture.betas), np.asarray(worn.faces)
     moved = np.concatenate([displacement, np.zeros((len(rest) - count, 3))])
     held = np.where(np.arange(len(rest)) < count, HELD, 0.0)
     moved[count:] = to_edges(masked_views(worn, rest, capture), rest + moved, faces, held, REACH)[count:]
@@ -75,14 +75,14 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
     legs = _legs(body)
     if legs is None or capture.masks is None:
         return None
-    levels, rest = np.linspace(TOP, BOTTOM, ROWS), shaped(body, capture)
+    levels, rest = np.linspace(TOP, BOTTOM, ROWS), shaped(body, capture.betas)
     joints = np.asarray(body.joint_regressor, float) @ rest
     radii = _radii(body, rest, joints, legs, levels)
     shares = np.arange(1, GAP + 1)[:, None] / (GAP + 1)
     asked, shown, clear = np.zeros((3, ROWS))
     cameras, empty = jax.tree.map(np.asarray, capture.cameras), empty_views(capture.masks)
     for i in [i for i in range(capture.view_count) if i not in empty]:
-        linear, offset = skinned(body, joints, capture, int(capture.frames[i]), np.eye(len(joints)))
+        linear, offset = skinned(body, joints, capture.poses, int(capture.frames[i]), np.eye(len(joints)))
         axes = _along(np.einsum("jab,jb->ja", linear, joints) + offset, legs, levels)
         between = (1 - shares) * axes[0][:, None] + shares * axes[1][:, None]
         project = cameras.K[i] @ cameras.cam_from_world[i, :3]

@@ -236,19 +236,25 @@ def cropped(capture: Capture, size: int) -> Capture:
         boxes.append((*((low + high - side) // 2).tolist(), side))
     if min(side for *_, side in boxes) >= max(height, width):
         return capture
-    return _squares(capture, boxes, size)
+    images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
+    return dataclasses.replace(capture, images=images, masks=masks, cameras=cameras)
 
 
-def _squares(capture: Capture, boxes: Sequence[tuple[int, int, int]], size: int) -> Capture:
-    """The photos, each cut to a square (left, top, side), white beyond the photo, and resized to `size` pixels."""
+def _squares(
+    images: Float[np.ndarray, "v h w 3"],
+    masks: Float[np.ndarray, "v h w"] | None,
+    cameras: Camera,
+    boxes: Sequence[tuple[int, int, int]],
+    size: int,
+) -> tuple[Float[np.ndarray, "v size size 3"], Float[np.ndarray, "v size size"] | None, Camera]:
+    """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo, and resized to `size` pixels."""
     cut = lambda array, fill: np.stack([resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)])
     left, top, sides = np.asarray(boxes, np.float32).T
     shift = np.zeros((len(boxes), 3, 3), np.float32)
     shift[:, 0, 2], shift[:, 1, 2] = left, top
     scale = np.stack([size / sides, size / sides, np.ones_like(sides)], axis=-1)
-    cameras = replace(capture.cameras, K=(capture.cameras.K - shift) * scale[:, :, None], width=size, height=size)
-    masks = None if capture.masks is None else cut(capture.masks, 0.0)
-    return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=masks, cameras=cameras)
+    cameras = replace(cameras, K=(cameras.K - shift) * scale[:, :, None], width=size, height=size)
+    return cut(images, 1.0), None if masks is None else cut(masks, 0.0), cameras
 
 
 def _window(image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float) -> Float[np.ndarray, "side side *c"]:
@@ -291,13 +297,14 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     capture = cropped(capture, size) if crop else capture
     height, width = capture.images.shape[1:3]
     side = max(height, width)
-    square = _squares(capture, [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count, size)
-    masks = np.zeros(square.images.shape[:3], np.float32) if square.masks is None else square.masks
+    boxes = [(-((side - width) // 2), -((side - height) // 2), side)] * capture.view_count
+    images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
+    masks = np.zeros(images.shape[:3], np.float32) if masks is None else masks
     frames = np.asarray(capture.frames)
     return SubjectViews(
-        images=jnp.asarray(square.images, jnp.float32),
+        images=jnp.asarray(images, jnp.float32),
         masks=jnp.asarray(masks, jnp.float32),
-        cameras=square.cameras,
+        cameras=cameras,
         rotations=jnp.asarray(capture.poses.rotations)[frames],
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
