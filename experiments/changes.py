@@ -68,7 +68,7 @@ def change(function: Callable[..., Any]) -> Callable[..., Change]:
 
 @change
 def photos(capture, changed: Callable[[np.ndarray], np.ndarray]):
-    """Other colors on the person; white behind."""
+    """The colors of the person changed, on white."""
     masks = capture.masks[..., None]
     return dataclasses.replace(capture, images=masks * np.clip(changed(capture.images), 0, 1) + (1 - masks))
 

@@ -108,7 +108,7 @@ class Start(NamedTuple):
     settings: dict[str, Any]
 
     def subject(self, seed: int, counts: Sequence[int], size: int | None = None) -> "EvaluationSubject":
-        """The person of a seed with what so many photos need, see `make_evaluation_subject`."""
+        """The person of a seed, with photos for these numbers of views: see `make_evaluation_subject`."""
         return make_evaluation_subject(seed, self.body, counts, size or self.size, self.held_out)
 
     def rows(

@@ -213,7 +213,7 @@ def painted(case: Any, background: float) -> Predicted:
 
 
 def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict[str, Any]:
-    """Task -> score -> a number a person, of the people of a folder with held_out/, from so many photos."""
+    """Task -> score -> a number a person, of the people of a folder with held_out/, from `count` photos."""
     rows = evaluate(people, method=method, inputs=count, protocol=PROTOCOL).rows
     found = {}
     for task, first in zip(TASKS, (True, False), strict=True):

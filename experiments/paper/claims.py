@@ -98,7 +98,7 @@ def measured(report: Mapping[str, Any], pair: Pair) -> Difference:
 
 
 def lacking(report: Mapping[str, Any], pairs: Iterable[Pair], seeds: int) -> str:
-    """What is missing for a verdict that needs so many seeds; "": nothing."""
+    """What is missing for a verdict that needs this many seeds; "": nothing."""
     ready, texts = trained_names(report), []
     for name in dict.fromkeys(name for pair in pairs for name, _ in pair[:2]):
         if name not in ready:

@@ -256,7 +256,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     """The number of the person that is meant: the one asked for, or the only one who is large.
 
     Arguments: sheet: where the numbers can be looked up; it is written where this cannot be decided.
-    Raises: ValueError if no photo has a person, or not so many, if several may be meant, or if it is unclear who is who.
+    Raises: ValueError if no photo has a person or none has this number, if several may be meant, or if it is unclear who is who.
     """
     try:
         return _chosen(photos, person, sheet)

@@ -87,7 +87,7 @@ def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list
 
 
 def few(names: Sequence[str], most: int = 4) -> str:
-    """Names for an error or a warning; beyond so many they are counted."""
+    """Names for an error or a warning; beyond `most` they are counted."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 

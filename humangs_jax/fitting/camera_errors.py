@@ -151,7 +151,7 @@ def _late_cameras(
         return [], keypoints
 
     def shifted(late):
-        """The keypoints of cameras that are late by so many frames, {camera: frames}, when the others saw the same."""
+        """The keypoints of late cameras, {camera: frames by which it is late}, when the others saw the same."""
         by = np.zeros(count, int)
         by[list(late)] = list(late.values())
         views = view_at[camera_of, np.asarray(photos.frames) + MOST_LATE + by[camera_of]]

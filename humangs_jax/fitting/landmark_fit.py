@@ -59,7 +59,7 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
 PLACED_FRAMES = 4
-"""From so many frames on a fit finds where the detector sees its landmarks: fewer say too little about shape and places both."""
+"""With this many frames a fit finds where the detector sees its landmarks: fewer say too little about both shape and places."""
 USUAL_COUNT, LEAST_RATIO = 16, 0.5
 """Keypoints that what is usual counts for, and its least share, where the noise of a landmark is found."""
 ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)

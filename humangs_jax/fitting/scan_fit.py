@@ -2,7 +2,7 @@
 
 start   position, size and stance: from given landmarks, or by a search over turns and stances
 coarse  without landmarks: few points and the body's joints, from several starts; the best goes on
-fine    all joints and the shape, many points; every round pairs scan and body anew, for a few steps of damped least squares
+fine    all joints and the shape, many points; every iteration pairs scan and body anew, for a few steps of damped least squares
 
 A scan has no unit: scale and height are those of a body of likely shape, unless `height` is given. Nor has it an up axis: the
 scan's axis nearest to the person's is used if one is near (`UPRIGHT`), otherwise the person's own.
@@ -51,16 +51,16 @@ from humangs_jax.fitting.triangulation import Similarity, align_robustly
 from humangs_jax.geometry.mesh import directions_around, face_areas
 
 COARSE_POINTS, FINE_POINTS = 600, 2500
-"""Points of the scan, and of the body's vertices, that look for partners in the search, and in the last rounds."""
+"""Points of the scan and vertices of the body that are matched: in the search, and in the last iterations."""
 STEPS, SHAPES = 4, 32
-"""Of the solver in a round; coefficients that are fitted."""
+"""Steps of the solver in an iteration; coefficients that are fitted."""
 FOLLOWED, TURNED = 16, 2
 """Starts that are followed; and how many of the best are also followed facing the other way."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Round:
-    """Settings of a round: gate and robust_scale of `Target.matches`, about metres; weight of the pose prior."""
+    """Settings of an iteration: gate and robust_scale of `Target.matches`, about metres; weight of the pose prior."""
 
     gate: float
     robust_scale: float
@@ -279,7 +279,7 @@ def search(
 
     found = sorted(map(follow, search_starts(whole.surface, scan, FOLLOWED)), key=lambda each: each[0])
     best = found[:TURNED]
-    found = [follow(start, state) for _, start, state in best]  # as many rounds as those that are turned
+    found = [follow(start, state) for _, start, state in best]  # as many iterations as those that are turned
     found += [follow(turned(start, state)) for _, start, state in best]
     _, start, state = min(found, key=lambda each: each[0])
     return start, replace(state_of(whole.origin, *trunk.body(state)), log_scale=state.log_scale)
@@ -300,7 +300,7 @@ FINE_NORMAL = 0.02
 LEAST_SCALE = 0.03
 """Metres: least robust scale for clothed people, the depth of folds."""
 SETTLED = 0.02
-"""A fit has converged if the last round gains less than this share of the cost."""
+"""A fit has converged if the last iteration gains less than this share of the cost."""
 LITTLE = 0.6
 """A smaller share of the scan near the body puts the fit in doubt. Wide skirts and long hair leave 0.7."""
 UPRIGHT = np.cos(np.radians(25.0))

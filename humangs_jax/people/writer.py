@@ -71,7 +71,7 @@ class Layout:
     """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
     novel_poses: int = 0
     frames: int = 0
-    """0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of so many, 30 a second."""
+    """0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of this many frames, 30 a second."""
     scan_texture: int = 0
     """Texels a side of the scan's texture, 0: no scan."""
 

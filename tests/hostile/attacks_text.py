@@ -80,7 +80,7 @@ PLACES = {
     "lhm": {"root_pose": 3},
     "joints json": {"left_hip": 3},
 }
-"""By reader: where a number or so many are expected."""
+"""By reader: places of numbers, and how many are expected there; 0: one number."""
 for reader, paths in PLACES.items():
     for path, count in paths.items():
         for kind, bad in BAD_NUMBERS.items():

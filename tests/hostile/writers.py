@@ -104,7 +104,7 @@ COMMANDS = (
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: just before its `event`-th change of a file, or so many seconds after the start.
+    """When a run is killed: just before its `event`-th change of a file, or some seconds after the start.
 
     by: the signal; SIGINT, as Ctrl-C in a terminal, after seconds, and the start is that of the command line.
     """

@@ -210,7 +210,7 @@ def looked_at(frames: Iterable[UInt[np.ndarray, "h w"]]) -> tuple[Float[np.ndarr
 
 
 def choose_frames(sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int) -> list[int]:
-    """Numbers of at most so many frames, in order.
+    """Numbers of at most `most` frames, in order.
 
     Raises: Refused if no frame shows anything.
     """

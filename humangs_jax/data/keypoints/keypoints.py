@@ -238,7 +238,7 @@ class Source:
 
 
 def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
-    """Images of people whose set is told by the number of their points. more: sets beside `SETS_BY_COUNT`.
+    """Detections of one keypoint set, chosen by the number of points of a person. more: sets beside `SETS_BY_COUNT`.
 
     Raises: CaptureError for other numbers, and for two sets.
     """

@@ -129,7 +129,7 @@ CLEARLY_UP = 0.5
 FLOOR_BAND = 0.05
 """Metres from the usual height of the lowest joint within which that joint is on the floor."""
 STILL = (0.1, 0.3)
-"""A joint rests on the floor if it moves by less than so many metres a second, or than this share of the joints' mean speed."""
+"""A joint rests on the floor if it moves by less than this many metres a second, or than this share of the joints' mean speed."""
 ON_THE_FLOOR = 0.5
 """Share of the frames with a joint on the floor from which on an axis has a floor; another axis has none at less than half of
 that axis's share."""

@@ -140,7 +140,7 @@ class ScanRenderer:
     """A scan on the device, aligned, with a texture for each view's distance.
 
     vertices, normals: (n, 3), faces: (f, 3), padded. uvs: (n, 2). scan: where the texture comes from. texel: scan units a texel.
-    textures: halved so many times, as far as they were needed.
+    textures: the texture by the number of times it was halved; made when first used.
     """
 
     vertices: Float[Array, "n 3"]

@@ -261,7 +261,7 @@ def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int,
 
 
 def padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """So many rows, the last of them 0."""
+    """The rows, and rows of zeros up to `count`."""
     return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
 
 
