@@ -250,7 +250,7 @@ class Check:
     For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views do not determine.
     """
 
-    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png",)
+    examples: ClassVar[tuple[str, ...]] = ("humangs check me --out check.png", "humangs check me --keypoints keypoints.json")
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
