@@ -257,9 +257,12 @@ class Tuned:
         """What was chosen, what it takes, and what it gives up against the best point, by the committed sweep."""
         takes = f"{self.cost.reconstruct_ms:.0f} ms a reconstruction, {self.cost.frame_ms:.1f} ms a frame"
         takes += "" if self.cost.memory_mb is None else f", {self.cost.memory_mb:.0f} MiB"
-        lost = self.best.psnr - self.point.psnr, self.best.psnr_poses - self.point.psnr_poses
-        gives = f"gives up {lost[0]:.1f} dB in the pose of the photos and {lost[1]:.1f} dB in novel poses against"
-        gives = "is the best of all settings" if self.point.name == self.best.name else f"{gives} {self.best.name!r}"
+        if self.point.name == self.best.name:
+            gives = "is the best of all settings"
+        else:
+            lost, in_poses = self.best.psnr - self.point.psnr, self.best.psnr_poses - self.point.psnr_poses
+            gives = f"gives up {lost:.1f} dB in the pose of the photos and {in_poses:.1f} dB in novel poses"
+            gives += f" against {self.best.name!r}"
         return f"{self.point.name}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 
 

@@ -264,10 +264,15 @@ class Check:
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture
             from humangs_jax.detection.people import available
+            from humangs_jax.fitting.files import UnknownViewError
 
         with stage("reading the capture"):
             capture = load_capture(self.capture, fit_masks=True)
-            keypoints, record = self.detections.read_or_recorded(self.capture, capture)
+            try:
+                keypoints, record = self.detections.read_or_recorded(self.capture, capture)
+            except UnknownViewError as error:
+                warn(f"{error}; the check does without that fit")
+                keypoints, record = None, None
         if available() and (capture.masks is None or keypoints is None):
             capture, keypoints = self._found(capture, keypoints)
         with stage("drawing the body"):

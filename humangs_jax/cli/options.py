@@ -244,7 +244,9 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
     """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ITERATIONS_ALONE`."""
-    return ITERATIONS_ALONE if text is None else None if text == "0" else refine_limits(text, "--refine")
+    if text is None:
+        return ITERATIONS_ALONE
+    return None if text == "0" else refine_limits(text, "--refine")
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":

@@ -352,9 +352,15 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
         return _build(options[0], value, path) if value is not None and len(options) == 1 else value
     if origin is tuple and isinstance(value, list):
         items = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(items) != len(value) or len(value) > MOST_ITEMS:
+        if len(value) > MOST_ITEMS:
+            raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
+        if len(items) != len(value):
             return tuple(value)
-        return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
+        built = tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
+        for i, item in enumerate(items):
+            if not _fits(built[i], item):
+                raise ValueError(f"{path}[{i}]: expected {in_words(item)}, got {value[i]!r}")
+        return built
     return float(value) if annotation is float and type(value) is int and abs(value) <= LARGEST_INTEGER else value
 
 

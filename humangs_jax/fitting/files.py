@@ -42,6 +42,10 @@ FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 # fit.npz -------------------------------------------------------------------------------------------------------------
 
 
+class UnknownViewError(ValueError):
+    """A capture has views that its fit does not know: photos were added after it."""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitRecord:
     """Contents of fit.npz, see the module."""
@@ -54,9 +58,9 @@ class FitRecord:
     shape_covariance: Float[np.ndarray, "s s"]
 
     def of_views(self, names: Sequence[str]) -> Keypoints:
-        """The keypoints of views, in their order. Raises: ValueError if the fit knows one of them not."""
+        """The keypoints of views, in their order. Raises: UnknownViewError."""
         if missing := [name for name in names if name not in self.names]:
-            raise ValueError(f"the capture's fit knows no view {few(missing)}: fit it again")
+            raise UnknownViewError(f"the capture's fit knows no view {few(missing)}: fit it again")
         rows = [self.names.index(name) for name in names]
         points, confidences = (getattr(self.keypoints, name)[rows] for name in ("points", "confidences"))
         return dataclasses.replace(self.keypoints, points=points, confidences=confidences)

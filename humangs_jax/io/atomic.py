@@ -5,6 +5,7 @@ later process writes to the same place; an old folder that it had already moved 
 """
 
 import contextlib
+import errno
 import functools
 import os
 import platform
@@ -95,14 +96,7 @@ def replace_folder(folder: str | os.PathLike[str], write: Callable[[Path], objec
     with _naming(folder, temporary), _unfinished(temporary):
         write(temporary)
         with undisturbed():
-            with contextlib.suppress(FileNotFoundError):
-                folder.rename(aside)
-            try:
-                temporary.rename(folder)
-            except BaseException:
-                with contextlib.suppress(OSError):
-                    aside.rename(folder)
-                raise
+            _exchange(folder, temporary, aside)
             shutil.rmtree(aside, ignore_errors=True)
 
 
@@ -135,6 +129,23 @@ def remove_unfinished() -> None:
         _remove(temporary)
 
 
+def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
+    """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
+    while True:
+        with contextlib.suppress(FileNotFoundError):
+            folder.rename(aside)
+        try:
+            temporary.rename(folder)
+            return
+        except BaseException as error:
+            if isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
+                continue
+            with contextlib.suppress(OSError):
+                aside.rename(folder)
+            raise
+
+
 def check_replaceable(
     folder: str | os.PathLike[str],
     overwrite: bool = True,
@@ -162,7 +173,8 @@ def check_replaceable(
         if wrong:
             raise ValueError(f"{folder}: {problem}")
     for path in (Path(path) for path in inputs if path is not None):
-        if place.exists() and any(real.is_relative_to(place) for real in (path.resolve(), path.absolute())):
+        # a loop of links ends `Path.resolve` with a RuntimeError
+        if place.exists() and any(real.is_relative_to(place) for real in (Path(os.path.realpath(path)), path.absolute())):
             raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
     entries = _entries(folder)
     if mark is None or not entries:
@@ -175,9 +187,17 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """What is in a folder: "body.npz, capture.json, images"; empty if there is nothing."""
+    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
     entries = _entries(folder)
-    return ", ".join(entries[:TOLD]) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+    told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
+    return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+
+
+def _told(entry: Path) -> str:
+    if entry.is_symlink() or not entry.is_dir():
+        return entry.name
+    count = sum(len(files) for _, _, files in os.walk(entry))
+    return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:

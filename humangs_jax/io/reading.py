@@ -346,7 +346,10 @@ def check_nesting(value: Any) -> None:
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
     """A configuration of class `cls` from its JSON, see `core.configuration`. Raises: FileNotFoundError; FileError."""
     with reading(path, "configuration"):
-        return config_from_json(cls, read_text(path))
+        try:
+            return config_from_json(cls, read_text(path))
+        except ValueError as error:
+            raise Refused(str(error)) from error
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:

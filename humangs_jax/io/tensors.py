@@ -266,12 +266,17 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
         raise Refused(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
         raise Refused("the state dict has a key that is no string")
-    arrays, left = {}, LARGEST_SHARE * size
-    for key, tensor in model.items():
-        if not wanted(key):
-            continue
+    chosen = {key: tensor for key, tensor in model.items() if wanted(key)}
+    for key, tensor in chosen.items():
         if not isinstance(tensor, _Tensor):
             raise Refused(f"{label or 'state_dict'}[{shown(key)}] is no tensor but {type(tensor).__name__}")
+    arrays: Tensors = {}
+    left, held = LARGEST_SHARE * size, None
+    for key in sorted(chosen, key=lambda key: chosen[key].storage.name):  # each storage is read once, and one at a time is held
+        tensor = chosen[key]
+        if tensor.storage.name != held:
+            held = tensor.storage.name
+            tensor.storage.read.cache_clear()
         left -= math.prod(tensor.shape) * STORAGE_DTYPES[tensor.storage.kind].itemsize
         try:
             arrays[key] = tensor.to_array()
@@ -279,7 +284,7 @@ def _state_dict(content: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
             raise Refused(f"{key}: {error}") from error
         if left < 0:
             raise Refused(f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file")
-    return arrays, len(model) - len(arrays)
+    return {key: arrays[key] for key in chosen}, len(model) - len(chosen)
 
 
 def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:

@@ -53,6 +53,7 @@ class Fit:
     steps: Annotated[int, Range(1, 1000)] = 5
     shares: tuple[Annotated[float, Range(0, 1)], ...] = (0.5,)
     most: Annotated[int, Range(1, 9)] | None = None
+    pairs: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self):
         if self.most == 7:
@@ -87,6 +88,9 @@ def test_a_file_names_the_path_of_the_field():
         ('{"steps": 0}', "config.steps 0: expected 1 to 1,000"),
         ('{"shares": [2]}', "config.shares 2: expected 0 to 1"),
         ('{"shares": ' + json.dumps([0] * 300) + "}", "config.shares: expected at most 256"),
+        ('{"shares": [0.5, "x"]}', "config.shares[1]: expected float, got 'x'"),
+        ('{"pairs": [[], ["a", 1]]}', "config.pairs[1][1]: expected "),
+        ('{"pairs": [' + json.dumps(["a"] * 300) + "]}", "config.pairs[0]: expected at most 256"),
     ):
         with pytest.raises(ValueError) as caught:
             config_from_json(Fit, text)

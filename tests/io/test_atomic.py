@@ -250,11 +250,11 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
     thesis.write_text("dear")
     (tmp_path / "docs" / "deep").mkdir()
     (tmp_path / "docs" / "deep" / "b.txt").write_text("b")
-    assert atomic.contents(folder) == "a.txt, deep, thesis.tex" and atomic.contents(tmp_path / "none") == ""
+    assert atomic.contents(folder) == "a.txt, deep (1 file), thesis.tex" and atomic.contents(tmp_path / "none") == ""
     never = lambda temporary: pytest.fail("the work has begun")
     with pytest.raises(ValueError, match=r"holds no capture\.json: refusing"):
         atomic.replace_folder(folder, never, mark="capture.json")
-    with pytest.raises(ValueError, match=r"which deletes a\.txt, deep, thesis\.tex"):
+    with pytest.raises(ValueError, match=r"which deletes a\.txt, deep \(1 file\), thesis\.tex"):
         atomic.check_replaceable(folder, overwrite=False, mark=MARK)
     atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "scan.obj", None))
     (tmp_path / "link").symlink_to(thesis)
@@ -262,6 +262,8 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
     for given in (thesis, folder, folder / "deep" / "..", tmp_path / "link", folder / "linked"):
         with pytest.raises(ValueError, match="lies in it and would be deleted"):
             atomic.check_replaceable(folder, mark=MARK, inputs=(None, given))
+    (tmp_path / "loop").symlink_to("loop")
+    atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "loop",))  # whoever reads it says what is wrong
     assert thesis.read_text() == "dear"
 
 
