@@ -37,10 +37,10 @@ Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
 @entry
-def accelerator(
-    run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False, earlier: tuple[Path, ...] = ()
-) -> None:
-    """What an accelerator does: agreement with the CPU, and times. What fails is noted, and the next one begins.
+def accelerator(run: Run, stage: tuple[Stage, ...] = get_args(Stage), small: bool = False, earlier: tuple[Path, ...] = ()) -> int:
+    """What an accelerator does: agreement with the CPU, and times.
+
+    What fails is noted, the next one begins, and the exit status is 1.
 
     check: the same numbers on CPU and device: the shipped network, splatting by the schedule of each with gradients. splatting:
     forward and with gradients. people: rendered on the fly. reconstruct: the demo's photos. Training: `train_by_clock`.
@@ -56,11 +56,12 @@ def accelerator(
         rows = {name: row for record in records for name, row in record["rows"].items()}
         made = {name: records[0][name] for name in ("script", "arguments", "date", "machine", "versions")}
         publish(page_of(run.table), run.table, table_of(records[0]["settings"]["device"], rows), rows, made)
-        return
+        return 0
     settings = {"device": jax.devices()[0].device_kind, "small": small}
     cases = {f"{name}: {what}": functools.partial(_tried, measure) for name in stage for what, measure in STAGES[name](small)}
     found = run.rows(cases, settings)
     run.show(table_of(settings["device"], found), found)
+    return int(any("failed" in numbers for numbers in found.values()))
 
 
 def table_of(device: str, found: dict[str, dict[str, Any]]) -> str:
@@ -149,7 +150,7 @@ def people(small: bool) -> Iterator[Measurement]:
     def measure(batch, size):
         config = OnTheFlyConfig(input_size=size, target_size=size, views_at_once=7, pixels_per_step=1 << 30, depths=True)
         keys = jax.random.split(jax.random.key(0), batch)
-        make = jax.jit(jax.vmap(lambda key: on_the_fly_example(bank(), key, config)))
+        make = jax.jit(jax.vmap(functools.partial(on_the_fly_example, bank(), config=config)))
         time = float(medians({"all": lambda: jax.block_until_ready(make(keys))}, 3)["all"][0])
         return {"ms": time, "people a second": 1e3 * batch / time}
 
@@ -174,4 +175,4 @@ def reconstructed(small: bool) -> Iterator[Measurement]:
     yield "learned iterations", functools.partial(measure, True)
 
 
-STAGES = {"check": check, "splatting": splatting, "people": people, "reconstruct": reconstructed}
+STAGES = dict(zip(get_args(Stage), (check, splatting, people, reconstructed), strict=True))

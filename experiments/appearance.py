@@ -76,7 +76,7 @@ def appearance(
     sizes: sides of the photos in pixels (--size is not used)
     off: millimetres that the body is off, see `refinement`
     first_refiner: weights of the learned update for "iterations alone"; default: the shipped ones
-    first_network: weights of the network for it; default: the same
+    first_network: weights of the network for it; default: those of --weights
     details_sheet: faces, hands, hems and shoes: truth and both avatars, largest size
     """
     start = people.start()

@@ -181,7 +181,7 @@ def fit_end_to_end(run: Run, people: int = 4, seconds: float = 5.0) -> None:
         row = {f"{name}_psnr": float(s.psnr) for name, s in scores.items()}
         return row | {f"{name}_foreground": float(s.psnr_fg) for name, s in scores.items()} | {"joints_mm": millimetres}
 
-    settings = {"noise_px": NOISE_PX, "outliers": 0.0, "set": KIND, "seconds": seconds}
+    settings = {"noise_px": NOISE_PX, "set": KIND, "seconds": seconds}
     rows = run.rows({str(seed): functools.partial(measure, seed) for seed in range(FIRST, FIRST + people)}, settings)
     mean = means(list(rows.values()))
     cells = [[f"{name} parameters", *(f"{mean[f'{name}_{key}']:.2f}" for key in SCORES)] for name in ("true", "fitted")]
@@ -362,7 +362,7 @@ def fit_refinement(
                 draw(images / f"{seed}_{case}.png", start, refined.capture)
         return row
 
-    settings = {"split": "fitting", "views": views, "size": size, "noise_px": NOISE_PX, "exact": False, "cases": cases}
+    settings = {"views": views, "size": size, "noise_px": NOISE_PX, "cases": cases}
     seeds = seeds_of("fitting", 0, subjects)
     rows = list(run.rows({str(seed): functools.partial(measure, seed) for seed in seeds}, settings).values())
     mean = means(rows)
@@ -377,7 +377,7 @@ def fit_refinement(
     lines = [f"{case}: {halved(case, 'joints')}, {halved(case, 'aligned')} aligned" for case in mean]
     header = ("refined by", "IoU with the masks", "with the true body", "joints, mm", "aligned, mm", "focal, %", "s")
     run.show(
-        f"{len(rows)} people (fitting split from 0), {views} views of {size} px.\n\n{markdown_table(header, table)}\n\n"
+        f"{len(rows)} people of the fitting seeds, {views} views of {size} px.\n\n{markdown_table(header, table)}\n\n"
         f"People whose joint error was at least halved: {'; '.join(lines)}.",
         {"settings": settings, "cases": mean},
     )

@@ -54,7 +54,7 @@ def fit_scans(
         raise ValueError("--subjects: expected at least 1")
     body, each = load_body(), itertools.product(seeds_of("fitting", 0, subjects), kinds)
     cases = {f"{kind} {seed}": functools.partial(fit_one, seed, kind, body, without_joints) for seed, kind in each}
-    settings = {"split": "fitting", "noise_mm": NOISE_MM, "joints": not without_joints}
+    settings = {"noise_mm": NOISE_MM, "joints": not without_joints}
     rows = run.rows(cases, settings)
     numbers: dict[str, Any] = {kind: summary([row for name, row in rows.items() if name.startswith(kind)]) for kind in kinds}
     run.show(scans_table(numbers, without_joints), numbers | {"settings": settings})

@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -263,7 +263,7 @@ def real_person(
     data: Path,
     out: Path,
     label: str = "now",
-    rows: tuple[Literal["calibrated", "poses", "uncalibrated", "moments", "rooms", "start"], ...] = (),
+    rows: tuple[str, ...] = tuple(each.__name__ for each in ROWS),
     frames: tuple[int, ...] = FRAMES,
     pictures: Path | None = None,
 ) -> None:
@@ -280,16 +280,18 @@ def real_person(
     data: where `pose2sim` is downloaded to and what is made of it stays
     out: numbers are written here; a run of the same --label goes on where an earlier one stopped
     label: of this state of the package
-    rows: default: all
+    rows: how their names begin, as "calibrated, refine"
     frames: of the videos, 0 to 99
     pictures: JPEG of the avatar from all sides, and walking
     """
     if not all(0 <= frame < 100 for frame in frames):
         raise ValueError("--frames: expected 0 to 99")
+    if unknown := [row for row in rows if not row.startswith(names := tuple(each.__name__ for each in ROWS))]:
+        raise ValueError(f"--rows {unknown[0]}: expected beginnings of rows: {', '.join(names)}")
     enable_compile_cache()
     man = Man(data, frames)
-    wanted = [each for each in ROWS if not rows or each.__name__ in rows]
-    results = measure(out, label, itertools.chain.from_iterable(each(man) for each in wanted))
+    wanted = [each(man) for each in ROWS if any(row.startswith(each.__name__) for row in rows)]
+    results = measure(out, label, (case for case in itertools.chain(*wanted) if case[0].startswith(rows)))
     if pictures:
         body = man.body(man.numbers[0], "detected")
         draw_sheet(avatar_of(body), body, pictures)

@@ -125,6 +125,8 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
     Options:
     cases: words; only cases whose names have one of them
     """
+    if cases and run.publish:
+        raise ValueError("--publish writes the whole table: expected no --cases")
     (subject,), network = changes.subjects(1), load_weights()
 
     def measure(case):

@@ -73,15 +73,17 @@ def tradeoff(
     Options:
     out: JSON of the points; those that are there are not measured again
     subjects: how many people
-    only: knobs to measure
+    only: knobs to measure, beside the default point
     image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
     front: write humangs_jax/assets/front.json, where `humangs tune` finds it
     """
+    if unknown := set(only) - (knobs := {each.knob: None for each in points()}).keys():
+        raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(knobs)}")
     settings = settings_of()
     result = json.loads(out.read_text()) if out.exists() else {}
     if result.get("settings") != settings:
         result = {"settings": settings, "points": {}}
-    rows, wanted = result["points"], [p for p in points() if not only or p.knob in only]
+    rows, wanted = result["points"], [p for p in points() if not only or p.knob in (DEFAULT.knob, *only)]
     for each in wanted:
         if described(each) != rows.get(each.name, {}).get("what"):
             rows[each.name] = {"what": described(each), "people": []}

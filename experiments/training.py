@@ -92,6 +92,8 @@ class ChangedSource:
         self._source, self._change, self._index = source, change, index
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_source":  # of a copy that is being made
+            raise AttributeError(name)
         return getattr(self._source, name)
 
     def __len__(self) -> int:
@@ -228,7 +230,7 @@ def training_cost(
         return step_cost(as_variant(settings(preset, size, 4, 4, mesh.size), variant), mesh)
 
     cases = {f"{preset} {size} {v}": functools.partial(measure, size, v) for size in sizes for v in variants}
-    rows, table = run.rows(cases, {"chips": chips, "fsdp": None, "views": 4, "targets": 4}), []
+    rows, table = run.rows(cases, {"chips": chips}), []
     for what, row in rows.items():
         sent = sum(row["sent_bytes"].values())
         cells = [f"{row['flops'] / 1e12:.2f}", f"{row['convolution_flops'] / row['flops']:.0%}"]

@@ -98,8 +98,25 @@ def read_release_config(path: Path) -> dict[str, Any]:
 
 
 def complete_config(config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int) -> HumanGSConfig:
-    """A checkpoint's configuration with what the release's one adds to it. Raises: ValueError for another number of Gaussians."""
-    decoder = paper_parts(config.architecture)[2]
+    """A checkpoint's configuration with what the release's one adds to it. Raises: ValueError where they do not agree."""
+    encoder, _, decoder = paper_parts(config.architecture)
+    transformer = encoder.transformer
+    found = {
+        "neural_texture.resolution": encoder.texture.resolution,
+        "neural_texture.dim": encoder.texture.channels,
+        "image_tokenizer.patch_size": encoder.patch_size,
+        "transformer.d": transformer.width,
+        "transformer.d_head": transformer.head_width,
+        "transformer.n_layer": transformer.layers,
+        "transformer.use_qk_norm": transformer.qk_norm,
+        "transformer.use_cls_token": transformer.class_token,
+        "transformer.use_upsampler": encoder.upsampler is not None,
+        "vertex_decoder.hidden_dim": decoder.hidden,
+        "vertex_decoder.learnable_lbs_weights": decoder.skinning_joints is not None,
+    }
+    for name, value in found.items():
+        if release.get(name) not in (None, value):
+            raise ValueError(f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint")
     tight, free = (release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free"))
     if tight is not None and free is not None:
         if tight + free != decoder.gaussians_per_vertex:

@@ -39,8 +39,8 @@ from humangs_jax.training.sources import people_on_disk
 
 COUNTS = (1, 2, 4, 6)
 K_VARIANTS = ("1 Gaussian a vertex", REFERENCE)
-Measure = Callable[..., dict[str, Any] | None]
-"""(name, people, photos, whether these show other poses) -> what `rows.measured` gives; each is measured once."""
+Measure = Callable[..., Any]
+"""(name, people, photos, whether these show other poses) -> what `rows.measured` gives, or None; each is measured once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,19 +160,19 @@ def ours(
 ) -> list[list[str]]:
     """Our rows: a name, its number of photos (or cameras), and for each column (people, photos, task) the scores.
 
-    cameras: then systems that take one photo are shown with one alone.
+    Those without a score for the first people are left out. cameras: then systems that take one photo are shown with one alone.
     """
     rows = []
     for name in names:
         found = [measure(name, people, photos, varying=task == "varying") for people, photos, task in columns]
-        if any(found):
-            count = next(row["photos"] for row in found if row)
-            cells = []
-            for row, (_, photos, task) in zip(found, columns, strict=True):
-                known = row and (not cameras or row["photos"] == photos)
-                cells.append(triple(row["animation" if task == "varying" else task]) if known else "-")
-            rows.append([name, cameras or ("1 photo" if count == 1 else f"{count} photos"), *cells])
-    return [row for row in rows if set(row[2:]) != {"-"}]
+        if not found[0]:
+            continue
+        cells, count = [], found[0]["photos"]
+        for row, (_, photos, task) in zip(found, columns, strict=True):
+            known = row and (not cameras or row["photos"] == photos)
+            cells.append(triple(row["animation" if task == "varying" else task]) if known else "-")
+        rows.append([name, cameras or ("1 photo" if count == 1 else f"{count} photos"), *cells])
+    return rows
 
 
 def animation(names: list[str], measure: Measure, options: Any) -> str:
@@ -180,7 +180,7 @@ def animation(names: list[str], measure: Measure, options: Any) -> str:
     seconds = lambda value: "-" if value is None else significant(value)
     rows = [[name, PAPER, triple(x[:3]), *map(seconds, x[3:])] for name, x in ANIMATION.items()]
     for row in ours(names, measure, [(options.data, PHOTOS, "varying")]):
-        found = measure(row[0], options.data, PHOTOS, varying=True) or {}
+        found = measure(row[0], options.data, PHOTOS, varying=True)
         rows.append([*row, seconds(found["model_s"]), seconds(found["frame_s"])])
     return markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
 

@@ -33,8 +33,7 @@ def test_the_docs_show_what_is_in_their_json_files():
 def test_every_result_says_what_made_it(path):
     result = json.loads(path.read_text())
     assert result["script"]
-    known = result["date"] and result["machine"]["cpu"] and result["versions"]["jax"]
-    assert known or result["source"] == "transcribed from the document of version 0.1"
+    assert result["date"] and result["machine"]["cpu"] and result["versions"]["jax"]
     assert result["blocks"] and json_text(result) + "\n" == path.read_text()
 
 

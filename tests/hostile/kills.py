@@ -1,9 +1,9 @@
 """Kills commands that write at random moments: python kills.py FOLDER [--count 10] [--json FILE] [COMMAND ...]
-Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts [--count 100] [--json FILE] [COMMAND ...]
+Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts [--count 10] [--json FILE] [COMMAND ...]
 
-A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, or at any time. Then no file
-under a final name may be half-written or lost, and the next run has to make what a run that nobody disturbed makes, and to remove
-what the killed one left. See `writers` for what the commands compute meanwhile.
+A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, until a second after one, or
+at any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
+disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
 
 A run that is interrupted, at any time, has to exit with 130 and one line, and to leave nothing half-written and no temporary name
 itself; after the last of them the next run has to work.
@@ -29,10 +29,14 @@ INTERRUPTED = 130
 
 
 def some_moment(changes: list, generator: random.Random, interrupt: bool) -> Moment:
-    seconds = generator.uniform(0, changes[-1][0])
+    times = [when for when, *_ in changes]
+    at, kind, seconds = generator.randrange(len(times)), generator.random(), generator.uniform(0, times[-1])
     if interrupt:
         return Moment(seconds=seconds, by=signal.SIGINT)
-    return Moment(event=generator.randrange(len(changes))) if generator.random() < 0.5 else Moment(seconds=seconds)
+    if kind < 0.45:
+        return Moment(event=at)
+    gap = min(1.0, ([*times, times[-1] + 0.1][at + 1]) - times[at])
+    return Moment(event=at, seconds=generator.uniform(1e-6, gap)) if kind < 0.85 else Moment(seconds=seconds)
 
 
 def run_undisturbed(command: Command, place: Path, kept: Path, inputs: Path) -> tuple[dict, writers.Run, dict]:

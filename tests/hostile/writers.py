@@ -19,6 +19,7 @@ import select
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from pathlib import Path
@@ -104,7 +105,7 @@ COMMANDS = (
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: just before its `event`-th change of a file, or some seconds after the start.
+    """When a run is killed: just before its `event`-th change of a file, some seconds after that, or after the start.
 
     by: the signal; SIGINT, as Ctrl-C in a terminal, after seconds, and the start is that of the command line.
     """
@@ -152,7 +153,9 @@ class Changes:
             return
         self.seen.append((time.monotonic() - self.start, event, path))
         if self.moment is not None and self.moment.event == len(self.seen) - 1:
-            os.killpg(0, signal.SIGKILL)
+            if not self.moment.seconds:
+                os.killpg(0, signal.SIGKILL)
+            threading.Timer(self.moment.seconds, os.killpg, (0, signal.SIGKILL)).start()
 
 
 def start(command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None):

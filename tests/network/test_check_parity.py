@@ -157,6 +157,7 @@ UNUSABLE = {
     "an input missing": (spoil(lambda a: {k: x for k, x in a.items() if k != "in_c2w"}), "'in_c2w' is missing"),
     "an input of another shape": (spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}), "in_c2w has shape"),
     "no stages": (spoil(lambda a: {k: x for k, x in a.items() if k.startswith("in_")}), "no stage"),
+    "other sizes": (reconfigure("transformer", n_layer=3), "model.transformer.n_layer is 3"),
     "another K": (reconfigure("vertex_decoder", num_free_gaussians=0), "1 tight and 0 free"),
     "canonical maps": (reconfigure("training", use_canonical_maps=True), "use_canonical_maps"),
 }
