@@ -314,8 +314,10 @@ def write_found(
     Raises: ValueError if two photos have the same name but for the suffix.
     """
     files = [f"{MASKS}/{Path(photo.name).with_suffix('.png').as_posix()}" for photo in photos]
-    if several := [photo.name for photo, file in zip(photos, files, strict=True) if files.count(file) > 1]:
-        raise ValueError(f"{' and '.join(several)}: masks would have one name: rename all but one")
+    owners: dict[str, str] = {}
+    for photo, file in zip(photos, files, strict=True):
+        if (other := owners.setdefault(file, photo.name)) != photo.name:
+            raise ValueError(f"{other} and {photo.name}: both masks would be {file}: rename one")
 
     def write(temporary: Path) -> None:
         shown = [(photo, photo.people[person]) for photo in photos]

@@ -218,7 +218,7 @@ def photos_of_video(video: Path, folder: Path) -> str:
         if not isinstance(known, dict) or {key: known.get(key) for key in of_video} != of_video:
             problem = f"exists, and is not of {video.name} as it is now: expected another folder, or remove it"
             raise CaptureError(folder, "", problem)
-        return _chosen(video, folder, known["chosen"], known["frames"])
+        return _said(video, folder, known["chosen"], known["frames"])
     sharpness, thumbnails = looked_at(grey_frames(video, LONGER_SIDE))
     with reading(video, "video", CaptureError):
         chosen = choose_frames(sharpness, thumbnails, PHOTOS)
@@ -228,10 +228,10 @@ def photos_of_video(video: Path, folder: Path) -> str:
         write_json(place / MARK, {**of_video, "frames": len(sharpness), "chosen": chosen})
 
     replace_folder(folder, write, mark=MARK)
-    return _chosen(video, folder, chosen, len(sharpness))
+    return _said(video, folder, chosen, len(sharpness))
 
 
-def _chosen(video: Path, folder: Path, chosen: Sequence[int], count: int) -> str:
+def _said(video: Path, folder: Path, chosen: Sequence[int], count: int) -> str:
     return (
         f"{video}: {len(chosen)} of {count:,} frames, sharp ones that show different things ({', '.join(map(str, chosen))}), "
         f"are the photos in {folder / 'images'}; what is to be added goes into {folder}"

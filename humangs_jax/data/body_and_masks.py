@@ -107,9 +107,17 @@ def surface_points(
 
 
 def skinned(
-    body: BodyModel, joints: Float[np.ndarray, "j 3"], poses: BodyPose, frame: int, weights: Float[np.ndarray, "n j"]
+    body: BodyModel,
+    joints: Float[np.ndarray, "j 3"],
+    poses: BodyPose,
+    frame: int,
+    weights: Float[np.ndarray, "n j"],
+    corrected: bool = False,
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights. joints: of the rest pose."""
+    """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights.
+
+    joints: of the rest pose. corrected: with the body's pose correctives, if it has some; weights are those of all vertices.
+    """
     turns = Rotation.from_rotvec(np.asarray(poses.rotations[frame], float)).as_matrix()
     moves = np.zeros((len(joints), 3, 4))
     for j, parent in enumerate(body.parents):  # parents come first
@@ -117,7 +125,11 @@ def skinned(
         place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
         moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
     blended = (weights @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-    return blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
+    linear, offset = blended[..., :3], blended[..., 3] + np.asarray(poses.translation[frame], float)
+    if corrected and body.pose_directions is not None:
+        correction = np.asarray(body.pose_directions) @ (turns[1:] - np.eye(3)).ravel()
+        offset = offset + np.einsum("nab,nb->na", linear, correction)
+    return linear, offset
 
 
 def points_in_image(
@@ -260,9 +272,8 @@ def to_edges(views: list[MaskedView], rest: Points, faces: Faces, held: PerVerte
 
 def shaped(body: BodyModel, betas: Float[np.ndarray, " s"]) -> Points:
     """The vertices of the person's body in the T-pose."""
-    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ np.asarray(
-        betas, float
-    )
+    betas = np.asarray(betas, float)
+    return np.asarray(body.template, float) + np.asarray(body.shape_directions, float)[..., : len(betas)] @ betas
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
@@ -276,12 +287,7 @@ def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[Masked
         if i in unusable:
             continue
         if frame not in posed:
-            linear, offset = skinned(body, joints, capture.poses, frame, weights)
-            if body.pose_directions is not None:
-                turns = Rotation.from_rotvec(np.asarray(capture.poses.rotations[frame], float)).as_matrix()
-                correction = np.asarray(body.pose_directions) @ (turns[1:] - np.eye(3)).ravel()
-                offset = offset + np.einsum("nab,nb->na", linear, correction)
-            posed[frame] = linear, offset
+            posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)
         K, matrix = np.asarray(capture.cameras.K[i], float), np.asarray(capture.cameras.cam_from_world[i], float)
         if all(np.isfinite(x).all() for x in (rest, *posed[frame])):  # whoever poses the body names what is not
             views.append(_window(mask, K @ matrix[:3], *posed[frame]))

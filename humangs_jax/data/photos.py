@@ -180,7 +180,10 @@ def read_photos(
     file, views = folder / "capture.json", description["views"]
     if poses is None:
         frames = [expect(view.get("frame", 0), int, file, f"views[{i}].frame") for i, view in enumerate(views)]
-        poses = 1 + max(0, *frames)
+        for i, frame in enumerate(frames):
+            if frame < 0:
+                raise CaptureError(file, f"views[{i}].frame", f"expected 0 or more, got {frame}")
+        poses = 1 + max(frames, default=0)
         with reading(file, "capture", CaptureError):
             check_limit("frames", poses, "frames")
             check_limit("frames_per_photo", math.ceil(poses / len(views)), f"frames for each of {len(views)} photos")

@@ -158,6 +158,6 @@ def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path
 
 def test_two_photos_never_share_a_mask(tmp_path):
     photos = same_people([photo("a.jpg", found(1, 90.0)), photo("a.png", found(2, 90.0))])
-    with pytest.raises(ValueError, match=r"a\.jpg and a\.png: masks would have one name"):
+    with pytest.raises(ValueError, match=r"a\.jpg and a\.png: both masks would be masks/a\.png"):
         write_found(tmp_path, photos, 0)
     assert list(tmp_path.iterdir()) == []

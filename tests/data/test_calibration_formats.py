@@ -124,6 +124,30 @@ def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
         read_calibration(tmp_path / "cams", lambda name: (0, 0))
 
 
+@pytest.mark.parametrize(
+    ("file", "more", "problem"),
+    [
+        ("extri.yml", "K_a: [1.0]\ndist_a: [0.2, 0.0, 0.0, 0.0, 0.0]\n", None),
+        ("intri.yml", "R_a: [1.0]\nT_a: [1.0]\n", None),
+        ("intri.yml", "dist_a: [0.2]\n", r"intri\.yml: dist_a: expected k1"),
+        ("extri.yml", "T_a: [1.0]\n", r"extri\.yml: T_a: expected 3 numbers"),
+    ],
+)
+def test_easymocap_values_are_of_their_own_file(tmp_path, file, more, problem):
+    K, poses = written.scene()
+    written.write_easymocap(tmp_path, K, poses, NAMES)
+    text = (tmp_path / file).read_text()
+    (tmp_path / file).write_text(text + more)
+    if problem is not None:
+        with pytest.raises(CaptureError, match=problem):
+            read_calibration(tmp_path, lambda name: (0, 0))
+        return
+    cameras = read_calibration(tmp_path, lambda name: (0, 0)).cameras
+    assert cameras[0].distortion is None
+    np.testing.assert_allclose([camera.K for camera in cameras], written.integer_centers(K), atol=1e-6)
+    np.testing.assert_allclose([camera.cam_from_world for camera in cameras], poses, atol=1e-6)
+
+
 def test_rotation_vectors_are_read_where_there_is_no_matrix(tmp_path):
     K, poses = written.scene()
     source, images = rig(tmp_path, written.write_easymocap, "cams", K, poses)
@@ -335,7 +359,7 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
         ([{"camera_index": i % 3} for i in ALL], r"frames\[0\] and frames\[3\] have the camera_index 0, so they show"),
         ([{"camera_id": f"c{i % 2}"} for i in ALL], r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest"),
         ([{}] * 6, r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments"),
-        ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing"),
+        ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing, but other frames have it"),
         ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number, got None"),
         ([{"time": float("nan")} for i in ALL], r"frames\[0\]\.time: expected finite numbers"),
         ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),

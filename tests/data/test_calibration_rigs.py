@@ -14,11 +14,20 @@ NAMES, LENS, SIZE = written.NAMES, written.LENS, [written.WIDTH, written.HEIGHT]
 K, POSES = written.scene()
 
 
+OTHERS = {"distance": 2.0, "model": "fisheye"}
+OTHER_KEYS = 'distance = 2.0\nmodel = "fisheye"'
 FORMATS = {
     "Caliscope": ("camera_array.toml", lambda: written.tables("cameras.{}"), "0123", LENS),
     "Anipose": ("calibration.toml", lambda: written.tables("cam_{}", "{}"), NAMES, LENS),
     "Pose2Sim": ("Calib.toml", lambda: written.tables("cam_{}", "{}", "fisheye = false"), NAMES, LENS),
     "Panoptic": ("calibration_160906.json", written.panoptic, NAMES, LENS),
+    "TOML, other keys": ("Calib.toml", lambda: written.tables("cam_{}", "{}", OTHER_KEYS), NAMES, LENS),
+    "Panoptic, other keys": (
+        "calibration_1.json",
+        lambda: {"cameras": [c | OTHERS for c in written.panoptic()["cameras"]]},
+        NAMES,
+        LENS,
+    ),
     "Shelf": ("calibration_shelf.json", written.shelf, "0123", LENS),
     "Qualisys": ("Calib.qca.txt", written.qualisys, NAMES, [*LENS[:4], 0.0]),
 }
@@ -69,7 +78,7 @@ def test_a_binary_model_of_colmap_is_the_text_model(tmp_path):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         whole = (tmp_path / "binary" / name).read_bytes()
         (tmp_path / "binary" / name).write_bytes(whole[:-5])
-        with pytest.raises(CaptureError, match=f"{name}: not a readable COLMAP model"):
+        with pytest.raises(CaptureError, match=f"{name}: not a readable COLMAP model: cut short, or damaged"):
             read_calibration(tmp_path / "binary", lambda name: (1, 1))
         (tmp_path / "binary" / name).write_bytes(whole)
 
@@ -79,6 +88,17 @@ WRONG = {
     "fisheye": ("a.toml", written.tables("cam_{}", extra="fisheye = true"), "fisheye lenses are not supported"),
     "no place": ("a.toml", written.tables("cam_{}").replace("translation", "other"), r"cam_0\.translation: missing"),
     "no TOML": ("a.toml", "[cam_0", "not a readable calibration: Expected"),
+    "a size": (
+        "a.json",
+        '{"a": {"K": [1,0,0,0,1,0,0,0,1], "R": [0,0,0], "T": [0,0,0], "width": 0.5, "height": 2}}',
+        r"a\.width: expected",
+    ),
+    "a matrix": ("a.yml", "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1]}", "expected keys with values"),
+    "a JSON matrix": (
+        "a.json",
+        '{"type_id": "opencv-matrix", "rows": 1, "cols": 1, "dt": "d", "data": [1]}',
+        "expected keys with",
+    ),
     "entities": ("a.qca.txt", "<!DOCTYPE x [<!ENTITY a 'b'>]>" + written.qualisys(), "XML with entities"),
     "no focal length": ("a.qca.txt", written.qualisys().replace("focalLengthV", "other"), r"camera 0\.intrinsic\.focalLengthV"),
     "no list": ("a.json", json.dumps({"cameras": [{"name": "a"}]}), r"cameras\[0\]\.K: missing"),

@@ -11,7 +11,7 @@ from small import tetrahedron
 
 from humangs_jax.data import photos as photos_module
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.photos import check_photos, names_from_paths
+from humangs_jax.data.photos import check_photos, load_photos, names_from_paths
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
 
@@ -144,6 +144,12 @@ def test_frame_may_be_left_out_for_a_single_pose(folder):
     edit_npz(folder / "body.npz", rotations=np.zeros((1, JOINTS, 3)), translations=np.zeros((1, 3)))
     edit_description(folder, lambda d: [view.pop("frame") for view in d["views"]])
     assert list(load(folder).frames) == [0, 0, 0]
+
+
+def test_frames_of_photos_without_poses_are_counted_from_0(folder):
+    edit_description(folder, lambda d: [view.update(frame=-1) for view in d["views"]])
+    with pytest.raises(CaptureError, match=r"views\[0\]\.frame: expected 0 or more, got -1"):
+        load_photos(folder)
 
 
 def test_views_of_one_name_stay_apart(folder):

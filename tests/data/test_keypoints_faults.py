@@ -171,7 +171,23 @@ FAULTS = {
     "frame": ([{"frame_id": "a", "instances": []}], r"\[0\]\.frame_id: expected an integer, got 'a'"),
     "openpose coco": (
         {"people": [{"pose_keypoints_2d": [1.0] * 54}]},
+        r"people\[0\]\.pose_keypoints_2d: expected 75 numbers of BODY_25, got 54 .*--model_pose BODY_25",
+    ),
+    "openpose body": (
+        {"people": [{"pose_keypoints_2d": [1.0] * 57}]},
         r"people\[0\]\.pose_keypoints_2d: expected a flat list of 75 ",
+    ),
+    "openpose hand that is an object": (
+        {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": {}}]},
+        r"people\[0\]\.hand_left_keypoints_2d: expected",
+    ),
+    "openpose hand that is a number": (
+        {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": 0}]},
+        r"people\[0\]\.hand_left_keypoints_2d: expected",
+    ),
+    "easymocap hands of 20 and 22 points": (
+        {"annots": [{"keypoints": [[1, 2, 1]] * 25, "handl2d": [[1, 2, 1]] * 20, "handr2d": [[1, 2, 1]] * 22}]},
+        r"annots\[0\]\.handl2d: expected shape \(21, 3\), got \(20, 3\)",
     ),
     "openpose hand": (
         {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": [1.0] * 60}]},

@@ -344,6 +344,9 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["1"], ("cam_1", "11"), [None]),
         (["cam0/000000", "cam1/000000"], ("000000",), "both"),
         (["01", "1"], ("1", "01"), [1, 0]),  # as written, before numbers as numbers
+        (["other.jpg"], ("a", "photo_1_"), [None]),
+        (["a.jpg", "photo(1).jpg", "b.jpg"], ("a", "photo_1_"), [0, 1, None]),
+        (["a_1", "a_2"], ("a_1", "a_2"), [0, 1]),
     ],
 )
 def test_names(images, names, views):
@@ -364,6 +367,10 @@ def test_names(images, names, views):
         ([0, 1, 2], ("f_100", "f_101", "f_102"), [0, 1, 2]),
         ([0, 1, 2, 3], ("f_001", "f_002", "f_003"), [None, 0, 1, 2]),  # who knows: the numbers as they are
         ([0, 2, 3], ("f_001", "f_002", "f_003"), [None, 1, 2]),  # gaps
+        ([1, 2, 3, 4], ("cam0_rgb", "cam1_rgb", "cam2_rgb", "cam3_rgb"), [0, 1, 2, 3]),
+        ([0, 1, 2, 3], ("a1", "b2", "c3", "d4"), [0, 1, 2, 3]),
+        ([1], ("photo0",), [0]),
+        ([3, 4], ("left_1", "left_2", "right_3", "right_4"), [2, 3]),  # not one for every view
         ([5], ("front", "back"), [None]),
         ([], ("front",), []),
     ],

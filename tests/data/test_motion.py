@@ -188,6 +188,7 @@ def without(arrays, key):
 
 
 COLUMNS = "expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape"
+MATRICES = "expected rotation matrices"
 BAD = {
     "no motion": (dict(vertices=np.zeros(3)), ": no motion: expected one of the keys rotations"),
     "columns": ({**AMASS, "poses": np.zeros((FRAMES, 100))}, f": poses: {COLUMNS} (6, 100)"),
@@ -208,6 +209,8 @@ BAD = {
         smpl_params(body_pose=np.zeros((FRAMES, 60))),
         ": body_pose: expected shape (6, 63), or (6, 69) of SMPL, got (6, 60)",
     ),
+    "params, scaled": (smpl_params(global_orient=np.tile(1.04 * np.eye(3), (FRAMES, 1, 1))), f": global_orient: {MATRICES}"),
+    "params, mirrored": (smpl_params(global_orient=np.tile(-np.eye(3), (FRAMES, 1, 1))), f": global_orient: {MATRICES}"),
     "params, orient": (without(smpl_params(), "global_orient"), ": global_orient: missing"),
     "params, hand": (smpl_params(left_hand_pose=np.zeros((2, 45))), ": left_hand_pose: expected shape (6, 45)"),
 }

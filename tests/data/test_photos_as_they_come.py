@@ -229,6 +229,10 @@ def test_other_sizes_and_flags_are_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"was calibrated with 48 x 64: .* turned \(an EXIF orientation that got lost\)"):
         phone(tmp_path, 1, imgSize=[48, 64])
     assert not (tmp_path / "me").exists()
+    phone(tmp_path, 1, mask="shown")
+    save(tmp_path / "masks" / "a.png", np.zeros((written.HEIGHT, written.WIDTH)), 6)
+    with pytest.raises(CaptureError, match=r"a\.png: size: 48 x 64, but its photo has 64 x 48"):
+        import_cameras(tmp_path / "rig.json", tmp_path / "photos", tmp_path / "again", masks=tmp_path / "masks", up="+y")
 
 
 def test_photos_of_one_camera_with_different_flags_are_refused(tmp_path):

@@ -138,7 +138,10 @@ def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
     with reading(path, "calibration", CaptureError):
-        format, file = CAMERAS.found(path) or (None, None) if path.is_dir() else (CAMERAS.of_name(path), path)
+        if path.is_dir():
+            format, file = CAMERAS.found(path) or (None, None)
+        else:
+            format, file = CAMERAS.of_name(path), path
         if file is None:
             raise CaptureError(path, "", f"no cameras found: expected {CAMERAS.listed()}")
         if format is not None and format.folder:

@@ -223,7 +223,8 @@ def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int,
     Where both sizes are the same it is taken to be turned: most tools that make masks obey the flag.
     """
     own, size = read_checked(orientation, mask), photo_size(mask)
-    if (size if own < 5 else size[::-1]) == shown:
+    size = size if own < 5 else size[::-1]
+    if size == shown:
         return own
     if own == 1 and size == stored:
         return flag

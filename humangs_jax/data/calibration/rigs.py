@@ -59,7 +59,8 @@ def read_opencv(source: Source, format: CameraFormat) -> Calibration:
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
     if not nested:
         return source.calibration(format, _flat_cameras(values, lambda key: source.path))
-    return source.calibration(format, [_renamed_camera(name, each, {}, source.path, name) for name, each in nested.items()])
+    where = lambda name: lambda key: (source.path, f"{name}.{key}")
+    return source.calibration(format, [_one_camera(name, each, where(name)) for name, each in nested.items()])
 
 
 @functools.lru_cache(maxsize=1)
@@ -71,9 +72,12 @@ def _values(source: Source) -> dict[str, Any]:
 def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
     """The cameras of both files. Raises: CaptureError naming file and key."""
     inner, outer = source.path / "intri.yml", source.path / "extri.yml"
-    values = [parse_file_storage(checked_text(file), file) for file in (inner, outer)]
-    cameras = _flat_cameras(values[0] | values[1], lambda key: outer if key[0] in "RT" else inner)
-    return source.calibration(format, cameras, file=outer)
+    file_of = lambda key: outer if key.startswith(("R", "T")) else inner
+    values = {}
+    for file in (inner, outer):
+        content = parse_file_storage(checked_text(file), file)
+        values |= {key: value for key, value in content.items() if key == "names" or file_of(key) == file}
+    return source.calibration(format, _flat_cameras(values, file_of), file=outer)
 
 
 def _flat_cameras(values: Mapping[str, Any], file_of: Callable[[str], Path]) -> list[CalibratedCamera]:
@@ -92,8 +96,8 @@ def _flat_cameras(values: Mapping[str, Any], file_of: Callable[[str], Path]) -> 
 
 
 def _renamed_camera(name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str) -> CalibratedCamera:
-    """A camera of an entry in which OpenCV's keys may have other names. keys: theirs -> OpenCV's."""
-    theirs = {ours: key for key, ours in keys.items()} | {keys.get(key, key): key for key in entry}
+    """A camera of an entry in which OpenCV's keys have these names: theirs -> OpenCV's. Others are not looked at."""
+    theirs = {ours: key for key, ours in keys.items()} | {keys[key]: key for key in entry if key in keys}
     values = {ours: entry[key] for ours, key in theirs.items() if key in entry}
     return _one_camera(name, values, lambda key: (file, f"{field}.{theirs.get(key, key)}"))
 
@@ -112,9 +116,10 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
             raise CaptureError(*where(key), f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
         if (key.lower() == "d" or key.lower().startswith("dist")) and not isinstance(value, str):
             lens = brown_conrady(value, *where(key))
-    sizes = [values[key] for key in ("imgSize", "image_size") if key in values]
-    sizes += [[values[w], values[h]] for w, h in (("width", "height"), ("W", "H")) if {w, h} <= values.keys()]
-    return CalibratedCamera(name, K, pose, *(image_size(sizes[0], *where("imgSize")) if sizes else (None, None)), lens)
+    sizes = {key: values[key] for key in ("imgSize", "image_size") if key in values}
+    sizes |= {w: [values[w], values[h]] for w, h in (("width", "height"), ("W", "H")) if {w, h} <= values.keys()}
+    size = next((image_size(value, *where(key)) for key, value in sizes.items()), (None, None))
+    return CalibratedCamera(name, K, pose, *size, lens)
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
@@ -142,19 +147,21 @@ TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
     with reading(file, "YAML file", CaptureError):
-        if text.lstrip().startswith("{"):
-            return _matrices(parse_json(text), file, "")
-        check_limit("slow_text_bytes", len(text), "characters of YAML")
-        kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
-        try:
-            root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
-        values = {} if root is None else _value(root, file)
+        values = _matrices(parse_json(text), file, "") if text.lstrip().startswith("{") else _yaml(text, file)
         if not isinstance(values, dict):
             raise Refused("expected keys with values")
         return values
+
+
+def _yaml(text: str, file: Path) -> Any:
+    check_limit("slow_text_bytes", len(text), "characters of YAML")
+    kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
+    try:
+        root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
+    return {} if root is None else _value(root, file)
 
 
 class _Loader(yaml.SafeLoader):
@@ -217,7 +224,7 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
 
 # CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution --------------------------------------
 
-PANOPTIC_KEYS = {"t": "T", "resolution": "imgSize"}
+PANOPTIC_KEYS = {"K": "K", "distCoef": "dist", "R": "R", "T": "T", "t": "T", "resolution": "imgSize"}
 
 
 def recognizes_panoptic(source: Source) -> bool:
@@ -236,7 +243,7 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
 
 # TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
 
-TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "size": "imgSize"}
+TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}
 
 
 def recognizes_toml(source: Source) -> bool:

@@ -29,7 +29,7 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.capture_checks import CaptureError, checked_text, expect, floats, members, required
 from humangs_jax.data.formats import CameraFormat
-from humangs_jax.io.reading import read_bytes, reading, shown
+from humangs_jax.io.reading import Refused, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
 """Of an image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3) points as x y id."""
@@ -136,25 +136,31 @@ def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
             yield int(line.split()[0]), floats(_numbers(line.split()[1:4], file, where), file, where, (3,)).tolist()
 
 
-# Binary: read inside `reading`, which says what is wrong with files that are cut short ----------------------------------
+# Binary: read inside `reading`, which names the file -------------------------------------------------------------------
 
 
 class _Bytes:
-    """Numbers of a file, little-endian, one after the other."""
+    """Numbers of a file, little-endian, one after the other. Raises: Refused where it ends before."""
 
     def __init__(self, file: Path):
         self.data, self.at = read_bytes(file, "mesh_bytes"), 0
 
+    def take(self, size: int) -> bytes:
+        """The next bytes."""
+        self.at += size
+        if self.at > len(self.data):
+            raise Refused("not a readable COLMAP model: cut short, or damaged")
+        return self.data[self.at - size : self.at]
+
     def read(self, kinds: str) -> tuple[Any, ...]:
         """Values of the kinds of `struct`."""
-        values = struct.unpack_from("<" + kinds, self.data, self.at)
-        self.at += struct.calcsize("<" + kinds)
-        return values
+        return struct.unpack("<" + kinds, self.take(struct.calcsize("<" + kinds)))
 
     def name(self) -> str:
         """Up to the next zero."""
-        start, self.at = self.at, self.data.index(b"\0", self.at) + 1
-        return self.data[start : self.at - 1].decode("utf-8", "replace")
+        end = self.data.find(b"\0", self.at)
+        size = (end if end >= 0 else len(self.data)) - self.at
+        return self.take(size + 1)[:-1].decode("utf-8", "replace")
 
 
 def _binary_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
@@ -174,8 +180,7 @@ def _binary_images(file: Path) -> Iterator[Registered]:
         for i in range(*data.read("Q")):
             _, *pose, camera_id = data.read("i7di")
             name, (count,) = data.name(), data.read("Q")
-            rows = np.frombuffer(data.data, np.dtype("<f8,<f8,<i8"), count, data.at)
-            data.at += rows.nbytes
+            rows = np.frombuffer(data.take(24 * count), np.dtype("<f8,<f8,<i8"))
             points = np.asarray(rows.tolist(), np.float64).reshape(-1, 3)
             if not np.isfinite(points).all():
                 raise CaptureError(file, f"image {i}", "expected finite pixels")
@@ -187,7 +192,7 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
         data = _Bytes(file)
         for i in range(*data.read("Q")):
             point, *place, _, _, _, _, track = data.read("Q3d3BdQ")
-            data.read(f"{8 * track}x")
+            data.take(8 * track)
             yield point, floats(place, file, f"point {i}", (3,)).tolist()
 
 
@@ -306,7 +311,9 @@ def _values(frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []
     for i, frame in enumerate(frames if key else ()):
-        value = required(frame, key, file, f"frames[{i}].")
+        if key not in frame:
+            raise CaptureError(file, f"frames[{i}].{key}", "missing, but other frames have it: expected all or none")
+        value = frame[key]
         if not isinstance(value, str):
             floats(expect(value, float, file, f"frames[{i}].{key}"), file, f"frames[{i}].{key}", ())
         values.append(value)

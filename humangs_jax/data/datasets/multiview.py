@@ -91,14 +91,23 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     eyes = np.zeros((count, 6))
     parts = [angles[key] for key in ("global_orient", "body_pose", "jaw_pose")]
     rotations = np.concatenate([*parts, eyes, angles["left_hand_pose"], angles["right_hand_pose"]], axis=1)
-    shape = [np.atleast_2d(values.numbers(key, None, LARGEST_COEFFICIENT))[0] for key in ("betas", "expression")]
+    shape = []
+    for key in ("betas", "expression"):
+        rows = np.atleast_2d(values.numbers(key, None, LARGEST_COEFFICIENT))
+        if rows.ndim != 2 or len(rows) not in (1, count):
+            raise CaptureError(file, key, f"expected shape (1, any) or ({count}, any), got {rows.shape}")
+        shape.append(rows[0])
     betas = coefficients(body.model, shape[0], shape[1], file)
     return BodyParameters(betas, rotations.reshape(count, -1, 3), translations)
 
 
 def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     """The cameras of a file, pixel centres at +0.5; the world's axes stay. Raises: CaptureError naming file and camera."""
-    calibration = read_calibration(file, lambda name: (0, 0))  # sizes are in the file
+
+    def no_size(name: str) -> tuple[int, int]:
+        raise CaptureError(file, f"{name}.imgSize", "missing")
+
+    calibration = read_calibration(file, no_size)
     return checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
 
 

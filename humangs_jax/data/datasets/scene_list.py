@@ -93,8 +93,10 @@ def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -
     file = _list_of(path)
     scenes = read_scene_list(file)
     if size is None:
-        firsts = [frame for name, scene in scenes.items() for frame in members(scene, file, name, frames=list)[0][:1]]
-        images = (file.parent / str(frame.get("image_path")) for frame in firsts if isinstance(frame, dict))
+        # scenes without frames are refused when they are opened, and not all of the list
+        listed = (scene["frames"] for scene in scenes.values() if isinstance(scene.get("frames"), list))
+        firsts = (frames[0] for frames in listed if frames and isinstance(frames[0], dict))
+        images = (file.parent / str(frame.get("image_path")) for frame in firsts)
         first = next((image for image in images if image.is_file()), None)
         size = STORED_SIZE if first is None else max(read_checked(image_size, first))
     opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)

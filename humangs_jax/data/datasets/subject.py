@@ -210,7 +210,7 @@ STORED_SIZE = 512
 """Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it."""
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
 """An image on white and its mask."""
-THREADS = min(8, os.cpu_count() or 1)
+THREADS = os.cpu_count() or 1
 """That decode the photos of one request: JPEG decoding releases the interpreter's lock."""
 
 

@@ -161,10 +161,17 @@ def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> 
 def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
     """Vertices and triangles of an OBJ file, every vertex once and in the order of the file. Raises: CaptureError."""
     with reading(file, "mesh", CaptureError):
-        lines = [line.split() for line in read_text(file).splitlines()]
-        points = np.asarray([line[1:4] for line in lines if line[:1] == ["v"]], float)
-        faces = [[corner.partition("/")[0] for corner in line[1:]] for line in lines if line[:1] == ["f"]]
-        corners = np.asarray(faces, int) - 1
+        vertices, faces = [], []
+        for number, line in enumerate(read_text(file).splitlines(), 1):
+            kind, *words = line.split() or [""]
+            if (kind == "v" and len(words) < 3) or (kind == "f" and len(words) != 3):
+                expected = "three coordinates of a vertex" if kind == "v" else "three corners of a triangle"
+                raise Refused(f"line {number}: expected {expected}, got {len(words)}")
+            if kind == "v":
+                vertices.append(words[:3])
+            elif kind == "f":
+                faces.append([corner.partition("/")[0] for corner in words])
+        points, corners = np.asarray(vertices, float), np.asarray(faces, int) - 1
         check_array("v", points, (None, 3))
         check_indices("f", corners, (None, 3), len(points))
         return points, corners

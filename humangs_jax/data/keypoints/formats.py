@@ -183,6 +183,8 @@ SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
 OPENPOSE_PARTS = {"pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
 """The face, if it is there, is not read."""
+OTHER_MODELS = (3 * 15, 3 * 18, 3 * 135)
+"""Numbers of a person of MPI, COCO and BODY_135."""
 
 
 def recognizes_openpose(source: Source) -> bool:
@@ -201,13 +203,16 @@ def _openpose_person(person: Any, file: Path, field: str) -> Float[np.ndarray, "
     (body,) = members(person, file, field, pose_keypoints_2d=list)
     if len(body) % 3 == 0 and len(body) // 3 in SETS_BY_COUNT:
         return triples(body, file, f"{field}.pose_keypoints_2d")
+    if len(body) in OTHER_MODELS:
+        problem = f"expected 75 numbers of BODY_25, got {len(body)} of another model (OpenPose: --model_pose BODY_25)"
+        raise CaptureError(file, f"{field}.pose_keypoints_2d", problem)
     return _parts(person, OPENPOSE_PARTS, file, field)
 
 
 def _parts(person: dict[str, Any], counts: dict[str, int], file: Path, field: str) -> Float[np.ndarray, "k 3"]:
-    """The points of the parts of a person; those that were not detected are left out, or empty lists."""
+    """The points of the parts of a person; those that were not detected are left out, null, or empty lists."""
     points = [
-        triples(person[key], file, f"{field}.{key}", count) if person.get(key) else np.zeros((count, 3))
+        np.zeros((count, 3)) if person.get(key) in (None, []) else triples(person[key], file, f"{field}.{key}", count)
         for key, count in counts.items()
     ]
     return np.concatenate(points)
@@ -231,10 +236,13 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
         members(entry, file, field, keypoints=list)
-        numbers = lambda key, field=field, entry=entry: file_numbers(entry[key], file, f"{field}.{key}", (None, 3), nulls=True)
-        person = numbers("keypoints") if entry["keypoints"] else np.zeros((0, 3))
+        points = lambda key, count, field=field, entry=entry: file_numbers(
+            entry[key], file, f"{field}.{key}", (count, 3), nulls=True
+        )
+        person = points("keypoints", None) if entry["keypoints"] else np.zeros((0, 3))
         if len(person) == 25:  # BODY_25, perhaps with hands
-            person = np.concatenate([person, *(numbers(key) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS)])
+            hands = [points(key, 21) if entry.get(key) else np.zeros((21, 3)) for key in EASYMOCAP_HANDS]
+            person = np.concatenate([person, *hands])
         number = entry.get("personID", i)
         people[number if type(number) is int and 0 <= number < MOST_PEOPLE and number not in people else len(people)] = person
     first = next(iter(people.values()), np.zeros((0, 3)))

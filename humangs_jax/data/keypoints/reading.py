@@ -221,30 +221,32 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     frames in twelve digits), or are mere numbers (COCO's image ids, the frames of a video).
 
     Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way round, there are as many of
-    either, without gaps, and they are matched in order, for each video by itself; mere numbers also if they begin elsewhere.
+    either, without gaps, and they are matched in order, for each video by itself. Mere numbers are matched in order, wherever
+    they begin, if there is one for every view, and the last numbers in the views' names have no gaps either.
 
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
     find = _finder(names)
-    found = {image: find(image) for image in images}
+    numbers = sorted({image for image in images if isinstance(image, int)})
+    of_names = sorted(int(found[-1]) for name in names if (found := re.findall(r"\d+", name)))
+    one_for_each = len(numbers) == len(of_names) == len(names) and _no_gaps(numbers) and _no_gaps(of_names)
+    shift = of_names[0] - numbers[0] if one_for_each else 0
+    found = {image: find(image + shift if isinstance(image, int) else image) for image in images}
     for image, views in found.items():
         if len(views) > 1:
             both = " and ".join(repr(names[view]) for view in views[:2])
             raise ValueError(f"image number {image} could be view {both}: expected file names instead of numbers")
-    videos: dict[str | None, list[tuple[int, str | int]]] = {}
+    videos: dict[str, list[tuple[int, str | int]]] = {}
     for image in found:
-        prefix, number = (None, image) if isinstance(image, int) else _split_number(str(_stem(image)))
+        prefix, number = _split_number(str(_stem(image))) if isinstance(image, str) else ("", None)
         if number is not None:
             videos.setdefault(prefix, []).append((number, image))
     of_view = [_split_number(name)[0] for name in names]
-    first_view = min((int(number) for name in names for number in re.findall(r"\d+", name)[-1:]), default=0)
     for prefix, frames in videos.items():
-        numbers = sorted(number for number, _ in frames)
-        shift = first_view - numbers[0] if prefix is None else 1 - 2 * numbers[0]
-        gaps = numbers != list(range(numbers[0], numbers[0] + len(numbers)))
-        if gaps or len(numbers) < 2 or (prefix is not None and numbers[0] > 1):
+        counts = sorted(number for number, _ in frames)
+        if counts[0] > 1 or len(counts) < 2 or not _no_gaps(counts) or all(found[image] for _, image in frames):
             continue
-        moved = {image: find(n + shift if prefix is None else f"{prefix}{n + shift}") for n, image in frames}
+        moved = {image: find(f"{prefix}{number + 1 - 2 * counts[0]}") for number, image in frames}
         prefixes = {of_view[view] for views in moved.values() for view in views}
         all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1
         if all_of_one and sum(each in prefixes for each in of_view) == len(frames):
@@ -265,8 +267,9 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
     plain, ends, numbers = (collections.defaultdict(list) for _ in range(3))
     for i, name in enumerate(names):
         plain[_plain(name)].append(i)
-        for underscore in re.finditer("_", _plain(name)):
-            ends[_plain(name)[underscore.end() :]].append(i)
+        parts = _plain(name).split("_")
+        for first in range(1, len(parts) - 1):  # ends of one part, such as a number, could be of any camera
+            ends["_".join(parts[first:])].append(i)
         if found := re.findall(r"\d+", name):
             numbers[int(found[-1])].append(i)
 
@@ -277,7 +280,7 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
         # the names of views are made from paths in this way; with as many of the folders as fit, then numbers as numbers
         keys = [re.sub(r"[^\w.-]", "_", "_".join(parts[i:])).lstrip("._") for i in range(len(parts))]
         for key in keys:
-            for table, label in ((exact, key), (plain, _plain(key)), (ends, _plain(key) if "_" in key else "")):
+            for table, label in ((exact, key), (plain, _plain(key)), (ends, _plain(key))):
                 if len(views := table.get(label, [])) == 1:
                     return views
         return []
@@ -293,6 +296,10 @@ def _stem(image: str) -> PurePosixPath:
 def _split_number(name: str) -> tuple[str, int | None]:
     prefix = name.rstrip("0123456789")
     return prefix, int(name[len(prefix) :]) if len(prefix) < len(name) else None
+
+
+def _no_gaps(numbers: Sequence[int]) -> bool:
+    return len(numbers) > 0 and list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 def _plain(name: str) -> str:

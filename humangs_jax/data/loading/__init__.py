@@ -7,11 +7,11 @@ batches that are asked for next. Threads suffice: decoding and jitted functions 
 """
 
 import collections
-import concurrent.futures
 import dataclasses
 import itertools
 import time
 from collections.abc import Generator
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -98,9 +98,8 @@ class Loader:
         Errors of the threads are raised here, in their turn. Closing the generator (or leaving the loop over it) ends them.
         waiting: the time that the loop waited for batches is added to it.
         """
-        rows, begun = self.rows, collections.deque[list[concurrent.futures.Future]]()
-        pools = (concurrent.futures.ThreadPoolExecutor(count, "humangs-loader") for count in (self.threads, 1))
-        with next(pools) as readers, next(pools) as placer:
+        rows, begun = self.rows, collections.deque[list[Future]]()
+        with ThreadPoolExecutor(self.threads, "humangs-loader") as readers, ThreadPoolExecutor(1, "humangs-loader") as placer:
 
             def begin(step: int) -> None:
                 examples = [readers.submit(self.example_at, step, row) for row in rows]

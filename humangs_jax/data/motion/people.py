@@ -32,6 +32,8 @@ FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
 """Suffixes of files of one person each; others are of one frame each."""
 DEEPEST, SHOWN = 6, 12
+NEARLY_ORTHONORMAL = 0.1
+"""As `ORTHONORMAL`, of matrices that are meant to be rotations, and no people: whether they are is found out later."""
 
 
 class Person(NamedTuple):
@@ -141,7 +143,8 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     if place not in ("root", "all") or form.kind != "poses" or key not in values:
         return [Person(name, values)]
     shape = np.shape(as_array(values[key])) if not isinstance(values[key], list) else ()
-    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not are_rotations(as_array(values[key]))
+    turns = shape[1:] == (3, 3) and _off_rotations(as_array(values[key])) < NEARLY_ORTHONORMAL
+    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not turns
     several = several or (form.pivot == "head" and len(shape) == 3)
     if not several:
         return [Person(name, values)]
@@ -156,10 +159,14 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
 
 def are_rotations(array: np.ndarray) -> bool:
     """Whether the last two axes of an array are those of rotation matrices."""
-    if array.shape[-2:] != (3, 3) or array.dtype.kind not in "fiu":
-        return False
-    squares = array @ np.swapaxes(array, -1, -2)
-    return bool(np.abs(squares - np.eye(3)).max(initial=0) < ORTHONORMAL and (np.linalg.det(array) > 0).all())
+    return array.shape[-2:] == (3, 3) and _off_rotations(array) < ORTHONORMAL and bool((np.linalg.det(array) > 0).all())
+
+
+def _off_rotations(array: np.ndarray) -> float:
+    """How far R R^T of matrices is from 1, at most; infinite if they are no numbers."""
+    if array.dtype.kind not in "fiu":
+        return np.inf
+    return float(np.abs(array @ np.swapaxes(array, -1, -2) - np.eye(3)).max(initial=0))
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:

@@ -27,7 +27,7 @@ from humangs_jax.core.registry import imported
 from humangs_jax.data.capture import DEFAULT_BODY, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError, checked_json, expect, members
 from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays
-from humangs_jax.data.datasets.subject import BodyParameters, FileBody, Photo, PosedPerson, posed_people, turned
+from humangs_jax.data.datasets.subject import THREADS, BodyParameters, FileBody, Photo, PosedPerson, posed_people, turned
 from humangs_jax.data.datasets.thuman import (
     FIT_MESH,
     fit_error,
@@ -234,7 +234,7 @@ def _write_lists(out: Path, names: Sequence[str], settings: Settings) -> dict[st
 
 
 class View(NamedTuple):
-    """A photo to be written, None once it is. frame: which of the poses it shows. lengths are those of the scene."""
+    """A view to be written. photo: None once it is written. frame: which of the poses it shows. Lengths: of the scene."""
 
     name: str
     frame: int
@@ -309,10 +309,9 @@ def _make_video(body: FileBody, folder: Path, name: str, source: Path, settings:
     known: dict[str, Any] = {"missing": dict(subject.missing), "unreadable": {}}
 
     def views() -> Iterator[View]:
-        step = os.cpu_count() or 1
         with bar(total=len(chosen), desc=name, unit="photo", shown=progress) as done:
-            for first in range(0, len(chosen), step):
-                for i, photo in enumerate(subject.tried(chosen[first : first + step], settings.size), first):
+            for first in range(0, len(chosen), THREADS):
+                for i, photo in enumerate(subject.tried(chosen[first : first + THREADS], settings.size), first):
                     done.update()
                     view = subject.view_name(int(chosen[i]))
                     if isinstance(photo, Exception):

@@ -92,6 +92,7 @@ def swapped(path, one, other):
 # AvatarReX, whose readers THuman4.0 and, for poses and photos, ActorsHQ share -------------------------------------------
 
 POSES, RIG, CAMERA = "smpl_params.npz", "calibration_full.json", "22010708"
+NO_SIZE = {"file_path": "a", "camera_angle_x": 1.0, "transform_matrix": np.eye(4).tolist()}
 PHOTO, MASK = "22010708/00000001.jpg", "22010708/mask/pha/00000001.jpg"
 
 
@@ -111,10 +112,12 @@ AVATARREX = {
     "fewer frames in one array": (npz(POSES, transl=lambda x: x[:-1]), POSES, "transl", "(3, 3)", "(2, 3)"),
     "no frames": (npz(POSES, global_orient=lambda x: x[:0]), POSES, "global_orient", "(0, 3)"),
     "text": (npz(POSES, transl=lambda x: x.astype(str)), POSES, "transl", "real numbers"),
+    "betas in a column": (npz(POSES, betas=lambda x: np.zeros((10, 1))), POSES, "betas", "(3, any)", "(10, 1)"),
     "300 shape coefficients": (npz(POSES, betas=lambda x: np.ones((3, 300))), POSES, "betas", "'shape_10' is no shape direction"),
     "calibration missing": (removed(RIG),),
     "no K": (rig("K", None), RIG, CAMERA, "K", "missing"),
     "no image size": (rig("imgSize", None), RIG, CAMERA, "imgSize"),
+    "frames without sizes": (written(RIG, json.dumps({"frames": [NO_SIZE]})), RIG, "a.imgSize", "missing"),
     "a NaN in R": (rig("R", lambda x: [float("nan"), *x[1:]]), RIG, CAMERA, "R", "finite"),
     "a mirrored R": (rig("R", lambda x: [-v for v in x]), RIG, CAMERA, "mirrored"),
     "T in millimetres": (rig("T", lambda x: [1000 * v for v in x]), RIG, CAMERA, "expected metres"),
@@ -166,6 +169,8 @@ THUMAN = {
     "a mesh of another model": (text(MESH, "v ", "v 0 0 0\nv "), OBJ, "81 vertices"),
     "a mesh in other units": (scaled_obj(MESH, 1000), OBJ, "mm from this mesh"),
     "text in a vertex": (text(MESH, "v ", "v x y z\nv "), OBJ, "could not convert"),
+    "a short vertex": (text(MESH, "v ", "v 0 0\nv "), OBJ, "line 1: expected three coordinates of a vertex, got 2"),
+    "a quad": (text(MESH, "f ", "f 1 2 3 4\nf "), OBJ, "line 81: expected three corners of a triangle, got 4"),
     "a NaN in a vertex": (text(MESH, "v ", "v nan 0 0\nv "), OBJ, "finite"),
     "a face without its vertices": (text(MESH, "f ", "f 1 2 900\nf "), OBJ, "f: expected integers in [0, 80)"),
     "no texture": (removed("model/0001/material0.jpeg"), "0001.obj", "texture"),

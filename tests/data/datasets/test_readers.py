@@ -1,6 +1,7 @@
 """Every layout is read as it was written; nothing is decoded before it is asked for; what is missing is counted."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -133,6 +134,16 @@ def test_a_scene_list_leaves_out_and_counts_what_is_missing(tmp_path, body):
     (tmp_path / "smpl" / "1.npz").unlink()
     (person,) = open_people(tmp_path, body)
     assert person.subject.missing == {"no image": 1, "no smpl_path": 3} and len(person.subject) == 2
+
+
+def test_a_scene_without_frames_spoils_no_other(tmp_path, body):
+    file, *_ = write_scenes(tmp_path, model_arrays())
+    (scene,) = json.loads(file.read_text())
+    write_json(file, [{"scene_name": "empty"}, scene])
+    empty, whole = open_people(file, body)
+    assert whole.size == HEIGHT and len(whole.subject)
+    with pytest.raises(ValueError, match=r"empty\.frames: missing"):
+        empty.open()
 
 
 def test_canonical_hands_that_the_release_bent_do_not_matter(tmp_path, body):
