@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -313,6 +314,16 @@ def test_a_table_is_one_command_on_the_layout_of_its_data(layout, tmp_path, monk
     assert {task for task in bench.TASKS if found[task]} == tasks and all(0 < found[task][0] < 60 for task in tasks)
     if layout == "thuman":
         assert numbers["converted, near, 4"]["reconstruction"] != found["reconstruction"]
+
+
+def test_a_system_without_animation_has_a_row_and_one_without_scores_of_the_first_people_has_none():
+    scores, options = {"psnr": 20.0, "ssim": 0.9}, tables.Compared(data=Path("a"), other=(Path("b"),))
+    found = {"photos": 4, "reconstruction": scores, "animation": None, "model_s": 1.5, "frame_s": 0.5}
+    measure = lambda name, people, photos, varying=False: found if name == "lvsm" or people == Path("b") else None
+    shown = {name: tables.TABLES[name](["lvsm", "others alone"], measure, options) for name in tables.TABLES}
+    assert "| lvsm | 4 photos | - | 1.5 | 0.50 |" in shown["animation"]
+    assert "| lvsm | 4 photos | 20.00 / 0.900 / - | 20.00 / 0.900 / - |" in shown["domains"]
+    assert not any("others alone" in text for text in shown.values())
 
 
 def test_people_of_one_name_are_refused(tmp_path):
