@@ -152,7 +152,7 @@ def reconstruct_many(
     """
     names, batch = list(captures), batch or BATCH
     for start in range(0, len(names), batch):
-        done = [_tried(Reconstructed(name), "capture", captures[name]) for name in names[start : start + batch]]
+        done = [_tried(Reconstructed(name), "capture", captures[name], OSError) for name in names[start : start + batch]]
         good = [each.capture for each in done if each.capture is not None]
         avatars: Iterator[Avatar] = iter(())
         if len(good) > 1:
@@ -167,10 +167,11 @@ def reconstruct_many(
                 yield each._replace(avatar=avatar) if avatar is not None else _tried(each, "avatar", alone)
 
 
-def _tried(each: Reconstructed, field: str, make: Callable[[], Any]) -> Reconstructed:
+def _tried(each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]) -> Reconstructed:
+    """With what is made, or its error: ValueError, or one of other faults of the capture."""
     try:
         return each._replace(**{field: make()})
-    except (ValueError, OSError) as error:
+    except (ValueError, *faults) as error:
         return each._replace(error=error)
 
 

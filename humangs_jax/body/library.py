@@ -59,7 +59,8 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         if not own:
             return load_smplx(file, **smplx_options)
         if smplx_options:
-            raise TypeError(f"{file}: options of SMPL-X files do not apply to this file: {sorted(smplx_options)}")
+            which = "the shipped body" if path is None else f"the file {path}"
+            raise TypeError(f"options of SMPL-X files do not apply to {which}: {sorted(smplx_options)}")
         return read_body(file)
 
 
@@ -124,9 +125,11 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 def read_body(path: str | Path) -> BodyModel:
     """Read what `save_body` wrote. Raises: ValueError, naming the file and the key, if it is something else."""
     with reading(path, "body file"):
-        arrays, _ = read_npz(path)
+        arrays, pickled = read_npz(path)
         if str(arrays.get("format")) != FORMAT:
             raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
+        if pickled:
+            raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
         if missing := sorted(KEYS - set(arrays)):
             raise Refused(f"key '{missing[0]}' is missing")
         parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]

@@ -25,7 +25,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import replace
-from humangs_jax.geometry.mesh import directions_around, edges, face_crosses, in_front, vertex_areas
+from humangs_jax.geometry.mesh import directions_around, face_crosses, in_front, mesh_edges, vertex_areas
 
 # Finer ----------------------------------------------------------------------------------------------------------------
 
@@ -52,16 +52,16 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     faces = np.asarray(body.faces)
     linear["area"] = vertex_areas(linear["template"], faces)
     while True:
-        ends, edge_of_side = edges(faces)
-        lengths = np.linalg.norm(linear["template"][ends[:, 0]] - linear["template"][ends[:, 1]], axis=-1)
+        edges, edge_of_side = mesh_edges(faces)
+        lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
         if lengths.max() > FINEST * longest:
             raise ValueError(f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m")
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
             break
-        midpoint = np.full(len(ends), -1)
+        midpoint = np.full(len(edges), -1)
         midpoint[long] = len(linear["template"]) + np.arange(len(long))
-        middle = {name: 0.5 * (x[ends[long, 0]] + x[ends[long, 1]]) for name, x in linear.items()}
+        middle = {name: 0.5 * (x[edges[long, 0]] + x[edges[long, 1]]) for name, x in linear.items()}
         linear = {name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()}
         faces = _cut(faces, midpoint[edge_of_side])
     spacing = np.sqrt(vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA))
@@ -142,7 +142,8 @@ def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)
-    return np.mean([in_front(vertices, points, forward, cell, 2 * cell) for forward in directions_around(VIEWS)], axis=0)
+    directions = directions_around(VIEWS, turned=0.0)
+    return np.mean([in_front(vertices, points, forward, cell, 2 * cell) for forward in directions], axis=0)
 
 
 class _Mesh:

@@ -1,6 +1,7 @@
 """Who is compared with what: people from captures or a `Source`, and the methods that predict their views, the simplest last."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -324,6 +325,12 @@ def _nothing(case: Case, missing: tuple[str, ...]) -> Predicted:
     return Predicted(case.truth.images[:0], None, (), missing)
 
 
+@functools.cache
+def shipped_weights() -> tuple[Variables, HumanGSConfig]:
+    """The network that comes with the package."""
+    return load_weights()
+
+
 def choose_method(
     people: int,
     avatar: str | Path | Avatar | None = None,
@@ -344,7 +351,7 @@ def choose_method(
     if method is not None:
         return getattr(method, "__name__", "method"), method
     if weights is None:
-        return "shipped weights", weights_method(*load_weights())
+        return "shipped weights", weights_method(*shipped_weights())
     if isinstance(weights, str | Path):
         return Path(weights).name, weights_method(*load_weights(weights))
     return "weights", weights_method(*weights)

@@ -83,10 +83,10 @@ COLUMNS = {
     "iou": Column("IoU", 4, "up"),
     "semi_transparent": Column("semi_transparent", 4, "down"),
     "foreground": Column("share of the person", 3, ""),
-    "patches": Column("patches", 1, ""),
 }
 _OF_PATCHES = ("psnr", "ssim", "lpips_vgg", "lpips_alex", "lpips_squeeze")
 COLUMNS |= {f"patch_{x}": COLUMNS[x]._replace(heading=f"{COLUMNS[x].heading} of patches") for x in _OF_PATCHES}
+COLUMNS["patches"] = Column("patches", 1, "")
 
 
 class Gallery:
@@ -297,12 +297,14 @@ def evaluate(
         Scores by image, person and mean; `write` makes files of them.
 
     Raises:
-        ValueError: one line: nothing to compare, sizes that differ. KeyError: no such protocol.
+        ValueError: one line: unknown protocol, nothing to compare, sizes that differ.
         OSError: for files that cannot be read.
 
     Examples:
         >>> hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
     """
+    if isinstance(protocol, str) and protocol not in PROTOCOLS:
+        raise ValueError(f"no protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
     rules = PROTOCOLS[protocol] if isinstance(protocol, str) else protocol
     networks = {network.net: network for network in lpips}
     networks |= {net: load_lpips(net) for net in rules.lpips if net not in networks and net in installed_lpips()}

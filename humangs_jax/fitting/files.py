@@ -37,6 +37,7 @@ from humangs_jax.io.reading import reading, write_json
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
 FOUND = ("noise", "joint_std", "determined", "shape_covariance")
+KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
 
 
 # fit.npz -------------------------------------------------------------------------------------------------------------
@@ -86,6 +87,8 @@ def read_fit_record(path: str | Path) -> FitRecord:
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
         file = ArrayFile.open(path, CaptureError)
+        if missing := [key for key in KEYS if key not in file and key not in file.pickled]:
+            raise CaptureError(path, missing[0], "missing: expected a file that `humangs fit` wrote")
         own = lambda key, shape=None: numbers(file.array(key), path, key, shape)
         name, names = str(file.array("set")), tuple(map(str, file.array("names")))
         if name not in KEYPOINT_SETS:

@@ -44,7 +44,7 @@ from humangs_jax.fitting.residuals.keypoints import (
     frame_residuals,
     group_by_frame,
 )
-from humangs_jax.fitting.swaps import find_swaps
+from humangs_jax.fitting.swaps import find_exchanged_hands, find_swaps
 
 UNSEEN = 1e-8
 """Least information about position and orientation; keeps the inverse finite for frames without keypoints."""
@@ -162,8 +162,9 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
-    noise, undetermined = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)), ()
-    if record is not None:
+    if record is None:
+        noise, undetermined = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise)), ()
+    else:
         noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
     outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
@@ -173,7 +174,11 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     numbers = zip(capture.names, frame_of.tolist(), by_view(lengths), by_view(outliers), strict=True)
     rows = tuple(_view_report(*own) for own in numbers)
     violations = limit_violations(names, poses)
-    swaps = find_swaps(observations, kind, views, capture.names)
+    hands = find_exchanged_hands(keypoints, capture.names)
+    explained = {swap.views[0] for swap in hands}
+    others = find_swaps(observations, kind, views, capture.names)
+    others = (swap for swap in others if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead)))
+    swaps = (*hands, *others)
     report = FitReport(
         fitted="keypoints",
         errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},

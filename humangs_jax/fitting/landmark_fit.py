@@ -12,13 +12,13 @@ The first four are one program that runs with other weights and other free unkno
 """
 
 import functools
+import itertools
 import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
@@ -195,7 +195,12 @@ def _rigid_starts(
 
 def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     """The rotations that map the axes to each other."""
-    return np.rint(Rotation.create_group("O").as_matrix())
+    signed = (
+        np.eye(3)[list(order)] * np.asarray(signs)[:, None]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1, -1), repeat=3)
+    )
+    return np.stack([m for m in signed if np.linalg.det(m) > 0])
 
 
 def _kabsch(a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]) -> Float[Array, "3 3"]:

@@ -152,8 +152,12 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
 
 
 def _check(seen: PersonViews, height: float | None) -> None:
-    if not len(seen.points):
+    views = len(seen.points)
+    if not views:
         raise ValueError("no photo of the person: expected one or more")
+    counts = {len(x) for x in (seen.visibility, seen.world, seen.sizes, seen.focal, seen.photos)}
+    if counts != {views} or {len(seen.names)} != {x.shape[1] for x in (seen.points, seen.visibility, seen.world)}:
+        raise ValueError(f"expected points, visibility, world, sizes, focal and photos of {views} views")
     if height is not None and not 0.3 < height < 3:
         raise ValueError(f"height {height:g}: expected metres between 0.3 and 3")
     for photo, points, visible in zip(seen.photos, seen.points, _known(seen), strict=True):
@@ -202,7 +206,9 @@ def _evidence(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evid
         if flipped and _handedness(own, seen.names) < 0:  # the detector saw the body turned round as well
             own[:, 2] *= -1
     K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
-    world = in_camera_axes(world, points, weights, K, seen.names)
+    hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
+    middle = np.where((weights * hips).all(1, where=hips, keepdims=True), weights * hips, weights)
+    world = in_camera_axes(world, points, middle, K)
     world = np.asarray([x - (w[:, None] * x).sum(0) / w.sum() for x, w in zip(world, weights, strict=True)])
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]

@@ -20,9 +20,10 @@ from humangs_jax.body.model import (
     BodyModel,
     BodyPose,
     SurfacePoints,
-    person_vertices,
+    pose_body,
     pose_features,
     pose_points,
+    shape_body,
     without_expression,
 )
 from humangs_jax.core.array_types import Array, Bool, Float
@@ -54,6 +55,7 @@ from humangs_jax.fitting.state import (
     solve,
     zero_state,
 )
+from humangs_jax.fitting.triangulation import reprojection_errors
 from humangs_jax.geometry.camera import Camera
 
 LEAST_NOISE = 0.7
@@ -251,13 +253,16 @@ class Scene:
         empty = np.zeros(looked_at.images.shape[:3], np.float32)
         self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
-        self.edges = silhouettes.mesh_edges(self.faces)
+        self.edges = silhouettes.body_edges(self.faces)
         self.boundaries = [silhouettes.mask_boundary(mask, config.points) for mask in self.masks]
         kind = None if keypoints is None else keypoints.set
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        self.observations = None if keypoints is None else scaled_observations(self.cameras, keypoints, self.scale)
+        sizes = (capture.cameras, self.cameras)
+        self.keypoints, self.observations = (
+            None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras) for cameras in sizes
+        )
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
 
@@ -290,18 +295,18 @@ class Scene:
 
     def _keypoints(self, capture: Capture) -> Observations | None:
         """The keypoints, with the noise that a body finds: a detector's own bias is no evidence against the masks."""
-        if self.observations is None:
+        if self.keypoints is None or self.observations is None:
             return None
-        errors = jnp.asarray(self._errors(capture, self.observations), jnp.float32)
+        errors = jnp.asarray(self._errors(capture, self.keypoints) * self.scale, jnp.float32)
         return replace(self.observations, noise=found_noise(errors, self.observations.noise))
 
     def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
-        """Errors of the keypoints in pixels; NaN where there is none."""
-        cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
-        seen = replace(seen, K=cameras.K[:, None], cam_from_world=cameras.cam_from_world[:, None])
-        errors = body_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
+        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
+        seen = replace(seen, K=capture.cameras.K[:, None], cam_from_world=capture.cameras.cam_from_world[:, None])
+        betas = jnp.asarray(capture.betas)
+        errors = body_errors(self.model, betas, capture.poses, seen, capture.frames, reprojection_errors)
         known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
-        return np.where(known, np.linalg.norm(errors, axis=-1), np.nan)[:, 0]
+        return np.where(known, errors, np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
         """The body of a capture of these photos in every view."""
@@ -316,9 +321,9 @@ class Scene:
         ious = np.asarray([overlap(view.covered, mask) for view, mask in pairs])
         iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
         loss = 0.0 if iou is None else 1 - iou
-        if self.observations is not None and np.isfinite(errors := self._errors(capture, self.observations)).any():
-            median = float(np.nanmedian(errors))
-            keypoints, loss = median / self.scale, loss + median / self.height
+        if self.keypoints is not None and np.isfinite(errors := self._errors(capture, self.keypoints)).any():
+            keypoints = float(np.nanmedian(errors))
+            loss += keypoints * self.scale / self.height
         return Score(ious, iou, keypoints, loss)
 
 
@@ -331,7 +336,8 @@ def overlap(covered: Bool[np.ndarray, "h w"], mask: Float[np.ndarray, "h w"]) ->
 @jax.jit
 def posed_vertices(body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose) -> Float[jax.Array, "m n 3"]:
     """Vertices of a person in a batch of m poses, metres."""
-    return jax.lax.map(lambda pose: person_vertices(body, betas, pose), poses)
+    rest = shape_body(body, betas)
+    return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
 
 
 def _noise(boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]) -> float:

@@ -145,7 +145,7 @@ MANY_OUTLIERS = 0.3
 """Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw something else."""
 OFF = 4.0
 """Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows another pose or camera."""
-SLIGHTLY_BEYOND, FAR_BEYOND = 3.0, 10.0
+SLIGHTLY_BEYOND, FAR_BEYOND = np.rad2deg(0.05), 10.0
 """Degrees beyond a joint's limit that are no violation, and from which there is a warning: limits are rough."""
 UNSURE, UNDECIDED = 0.03, 0.1
 """A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is determined: a mean over axes, of

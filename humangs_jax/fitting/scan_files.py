@@ -67,6 +67,9 @@ def read_mesh(path: str | Path, colors: bool = False) -> Any:
     """
     import trimesh
 
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: {'a folder' if path.is_dir() else 'no such file'}: expected a mesh (OBJ, PLY, GLB, ...)")
     parts = read_meshes(path, colors=colors)
     faces = sum(len(part.faces) for part in parts)
     if faces < LEAST_FACES:
@@ -87,11 +90,14 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
     """Random points of a surface, uniform over its area.
 
     Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are detected.
+    Raises: ValueError if the surface has no area.
     """
     center = vertices[np.unique(faces)].mean(axis=0)
     corners = vertices[faces] - center
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
+    if not area.sum() > 0:
+        raise ValueError("the faces have no area: expected a surface")
     rng = np.random.default_rng(0)
     ends = np.cumsum(area)
     total = OCCLUDERS * count

@@ -82,24 +82,24 @@ LOOSE = 0.01
 
 def run_iterations(
     problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState, iterations: tuple[Round, ...]
-) -> tuple[FitState, float]:
-    """The body after some iterations, and the share of the cost by which the last one lowered it."""
-    gain = 0.0
+) -> tuple[FitState, Float[Array, "2"]]:
+    """The body after some iterations, and the cost before and after the last one."""
+    costs = jnp.zeros(2)
     for each in iterations:
         matches = target.matches(problem, state, each.gate, each.robust_scale, tolerances)
         own = dataclasses.replace(tolerances, prior=jnp.float32(each.prior))
-        before = float(_cost(problem, matches, given, own, state))
-        state, after = improve(problem, matches, given, own, state)
-        gain = 1 - float(after) / before
-    return state, gain
+        state, costs = improve(problem, matches, given, own, state)
+    return state, costs
 
 
 @functools.partial(jax.jit, static_argnames="steps")
 def improve(
     problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int = STEPS
-) -> tuple[FitState, Float[Array, ""]]:
-    """The body after at most `steps` steps of the solver with these pairs, and its cost."""
-    return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
+) -> tuple[FitState, Float[Array, "2"]]:
+    """The body after at most `steps` steps of the solver with these pairs, and the cost before and after them."""
+    residuals = lambda y: scan_residuals(problem, matches, given, tolerances, y)
+    found, after = solve(residuals, state, steps, method="lm")
+    return found, jnp.stack([half_squares(residuals(state)), after])
 
 
 def leftover(problem: ScanProblem, target: Target, given: Given, tolerances: Tolerances, state: FitState) -> float:
@@ -300,7 +300,7 @@ FINE_NORMAL = 0.02
 LEAST_SCALE = 0.03
 """Metres: least robust scale for clothed people, the depth of folds."""
 SETTLED = 0.02
-"""A fit has converged if the last iteration gains less than this share of the cost."""
+"""A last iteration that gains more than this share of the cost: the body was still moving."""
 LITTLE = 0.6
 """A smaller share of the scan near the body puts the fit in doubt. Wide skirts and long hair leave 0.7."""
 UPRIGHT = np.cos(np.radians(25.0))
@@ -370,11 +370,11 @@ def fit_scan(
     target = Target(scan, start.align, FINE_POINTS, effective, FINE_NORMAL)
     if clothed:
         iterations = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations)
-    state, gain = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
+    state, costs = run_iterations(whole, target, given(start.align), tolerances, state, iterations)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
     away, covered = target.distances(whole, state, iterations[-1].gate)
-    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, gain)
+    report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, costs)
     violations = limit_violations(body.joint_names, jax.tree.map(lambda leaf: leaf[None], pose))
     report = dataclasses.replace(report, violations=violations)
     return ScanFit(body, np.asarray(betas), pose, world_from_scan, up, scale * away, report)
@@ -400,7 +400,7 @@ def _report(
     up: str,
     distances: Float[np.ndarray, " r"],
     covered: float,
-    gain: float,
+    costs: Float[Array, "2"],
 ) -> FitReport:
     errors = {"scan_near_body": Change(covered)}
     if len(distances):
@@ -412,7 +412,8 @@ def _report(
     notes.append(f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface")
     if scan.turned:
         notes.append("the faces of the file were inside out and have been reversed")
-    if gain > SETTLED:
+    before, after = costs.tolist()
+    if before - after > SETTLED * before:
         notes.append("the body was still moving in the last round")
     doubt = "much of the scan is not near the body: does it contain a floor, or other things?"
     return FitReport(

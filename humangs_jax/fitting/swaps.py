@@ -1,10 +1,11 @@
 """Bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
 
-Views of one frame that are right agree: the rays of a landmark meet. Each exchange that people and detectors make is undone on
-trial, the clearest first, and reported if the views then agree clearly better:
+Views of one frame that are right agree: the rays of a landmark meet. Exchanges that people and detectors make are undone on
+trial; while the views then agree clearly better, the clearest is kept. Cameras are reported in this order, then sides by view:
 
     sides     left and right of the keypoints of one view; needs two views, of which either may be the wrong one
     cameras   of two views, which is the same as their photos; needs three views
+    hands     left and right keypoints of the hands alone, in one view
 
 Left and right exchanged in all views agree as well: that is not found.
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import KeypointSet
+from humangs_jax.data.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.fitting.residuals.keypoints import Observations
 from humangs_jax.fitting.state import camera_numbers
 from humangs_jax.fitting.triangulation import agreement, triangulate_robustly
@@ -36,6 +37,8 @@ MANY = 5
 """With this many views or more the right ones outvote an exchange: only exchanges that look better at once are tried."""
 ALIKE = 0.9
 """Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras several are equivalent."""
+HANDS_SHARE = 0.3
+"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance from their own."""
 SAME_CAMERA = 1e-3
 """Share of the focal length, and metres, by which a camera that stands still may differ between frames."""
 
@@ -48,12 +51,14 @@ class Swap:
     in how many; the views are those of the first.
     """
 
-    kind: Literal["sides", "cameras"]
+    kind: Literal["sides", "cameras", "hands"]
     views: tuple[str, ...]
     instead: tuple[str, ...] = ()
     frames: int = 1
 
     def __str__(self) -> str:
+        if self.kind == "hands":
+            return f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the other wrist"
         if self.kind == "cameras":
             frames = f", as in {self.frames} frames" if self.frames > 1 else ""
             other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
@@ -65,14 +70,15 @@ class Swap:
 def find_swaps(
     observations: Observations, kind: KeypointSet, views: Int[np.ndarray, "m c"], names: tuple[str, ...]
 ) -> tuple[Swap, ...]:
-    """Exchanged cameras, and then sides. Frames need two views for sides and three for cameras.
+    """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for sides and three for cameras.
 
     Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none, see `group_by_frame`.
     """
     mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
     order, exchanges = given(*views.shape), []
     while True:
-        flips, tried = _clear_trials(observations, mirror, cameras, order)
+        search = _Search(observations, mirror, cameras, order)
+        flips, tried = search.flips(), search.exchanges()
         best = max(tried, key=lambda each: each.gain, default=None)
         if best is not None and best.gain >= sum(flips[m].gain for m in best.frames if m in flips):
             exchanges.append(_cameras(best, tried, views, names))
@@ -82,6 +88,18 @@ def find_swaps(
             order = order.exchanged(frames, slots, None)
         else:
             return (*exchanges, *_sides(observations, views, order, names))
+
+
+def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
+    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on exchanged crops leave them."""
+    wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
+    if not set(wanted) <= set(keypoints.set.names):
+        return ()
+    rows = [keypoints.set.names.index(name) for name in wanted]
+    hands, wrists = np.split(keypoints.points[:, rows], 2, axis=1)
+    own, other = (np.linalg.norm(hands - at, axis=-1).sum(1) for at in (wrists, wrists[:, ::-1]))
+    exchanged = (keypoints.confidences[:, rows] > 0).all(1) & (other < HANDS_SHARE * own)
+    return tuple(Swap("hands", (names[view],)) for view in np.flatnonzero(exchanged))
 
 
 # How well views agree --------------------------------------------------------------------------------------------------
@@ -167,62 +185,80 @@ class _Trial(NamedTuple):
     b: Int[np.ndarray, " e"] | None
 
 
-def _clear_trials(
-    observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
-) -> tuple[dict[int, _Trial], list[_Trial]]:
-    """The exchanges of keypoints in an order that are clear: by frame that of the sides of one view which adds most; and those of
-    two cameras, in all of their frames together, and in each alone.
+class _Search:
+    """Keypoints in an order, how well the views agree, and what exchanges would add.
 
-    Arguments: cameras: (m, c) equal numbers for one camera that stands still, -1: no view.
+    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,) agreement. views: (m, c) with
+    keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
     """
-    seen = arranged(observations, mirror, order)
-    found = jax.tree.map(np.asarray, _agreements(seen, mirror))
-    confidences, frame_count = np.asarray(seen.confidences), len(cameras)
-    shown = (confidences > 0).any(-1)
-    count, own = shown.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
 
-    def gains(frames, a, b=None):
+    def __init__(
+        self, observations: Observations, mirror: Int[np.ndarray, " k"], cameras: Int[np.ndarray, "m c"], order: Order
+    ) -> None:
+        self.observations, self.mirror, self.cameras, self.order = observations, mirror, cameras, order
+        seen = arranged(observations, mirror, order)
+        found = jax.tree.map(np.asarray, _agreements(seen, mirror))
+        self.confidences = np.asarray(seen.confidences)
+        self.total, self.views = found.own.sum(-1), (self.confidences > 0).any(-1)
+        count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
+        self.sides = self.views & (count > 1) & ((count < MANY) | (found.mirrored > own))
+        self.several = self.views & (count > 2)
+        better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
+        self.pairs = self.several[:, :, None] & self.several[:, None] & ((count < MANY)[..., None] | better)
+
+    def gains(
+        self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"] | None = None
+    ) -> Float[np.ndarray, " e"]:
         """(e,) agreement that an exchange adds in each of its frames."""
-        after = _agreements(arranged(observations, mirror, order.exchanged(frames, a, b)), mirror).own
-        return (np.asarray(after).sum(-1) - found.own.sum(-1))[frames]
+        order = self.order.exchanged(frames, a, b)
+        own = _agreements(arranged(self.observations, self.mirror, order), self.mirror).own
+        return (np.asarray(own).sum(-1) - self.total)[frames]
 
-    def clear(gain, of, frames, a, b=None):
-        """The exchange of the keypoints `of`, or None: attainable is that all agree that another view sees."""
-        known = (confidences > 0) & of
-        shared = known & (known.sum(axis=1, keepdims=True) > 1)
-        total = lambda values: float(sum(values[frames, slots].sum() for slots in (a, b) if slots is not None))
-        most, number = total((confidences * shared).sum(-1)), total(shared.sum(-1))
-        share = gain / max(most, 1e-6)
-        return _Trial(gain, frames, a, b) if share > LEAST_GAIN + CHANCE / max(number, 1) ** 0.5 else None
+    def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
+        """Whether an exchange of the keypoints `of` gains enough: attainable is that all agree that another view sees."""
+        seen = (self.confidences > 0) & of
+        shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
+        slots = [slot for slot in (trial.a, trial.b) if slot is not None]
+        total = lambda values: float(sum(values[trial.frames, slot].sum() for slot in slots))
+        most, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
+        return trial.gain / max(most, 1e-6) > LEAST_GAIN + CHANCE / max(count, 1) ** 0.5
 
-    flips: dict[int, _Trial] = {}
-    sides = shown & (count > 1) & ((count < MANY) | (found.mirrored > own))
-    sided, every = mirror != np.arange(len(mirror)), np.ones(len(mirror), bool)
-    for slot in np.flatnonzero(sides.any(0)):
-        frames = np.flatnonzero(sides[:, slot])
-        for frame, gain in zip(frames.tolist(), gains(frames, np.full(len(frames), slot)).tolist(), strict=True):
-            trial = clear(gain, sided, np.asarray([frame]), np.asarray([slot]))
-            if trial is not None and (frame not in flips or gain > flips[frame].gain):
-                flips[frame] = trial
+    def flips(self) -> dict[int, _Trial]:
+        """The view of each frame whose sides are exchanged most clearly, by frame."""
+        found: dict[int, _Trial] = {}
+        sided = self.mirror != np.arange(len(self.mirror))
+        for slot in np.flatnonzero(self.sides.any(0)):
+            frames = np.flatnonzero(self.sides[:, slot])
+            gains = self.gains(frames, np.full(len(frames), slot))
+            for frame, gain in zip(frames.tolist(), gains.tolist(), strict=True):
+                trial = _Trial(gain, np.asarray([frame]), np.asarray([slot]), None)
+                if self.is_clear(trial, sided) and (frame not in found or gain > found[frame].gain):
+                    found[frame] = trial
+        return found
 
-    better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
-    several = shown & (count > 2)
-    pairs = several[:, :, None] & several[:, None] & ((count < MANY)[..., None] | better)
-    numbers = lambda frame, a, b: tuple(sorted(cameras[frame, [a, b]].tolist()))
-    suspected = {numbers(*at) for at in np.argwhere(pairs)}
-    tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
-    for a, b in itertools.combinations(range(cameras.shape[1]), 2):
-        both = [m for m in range(frame_count) if several[m, a] and several[m, b] and numbers(m, a, b) in suspected]
-        if both:
-            frames = np.asarray(both)
-            for frame, gain in zip(both, gains(frames, np.full(len(frames), a), np.full(len(frames), b)), strict=True):
-                tried.setdefault(numbers(frame, a, b), []).append((float(gain), frame, a, b))
-    alone = [[each] for group in tried.values() if len(group) > 1 for each in group]
-    exchanges = []
-    for group in (*tried.values(), *alone):
-        own_gains, *where = map(np.asarray, zip(*group, strict=True))
-        exchanges.append(clear(float(own_gains.sum()), every, *where))
-    return flips, [trial for trial in exchanges if trial is not None]
+    def exchanges(self) -> list[_Trial]:
+        """Exchanges of two cameras in all of their frames together, and in each alone."""
+        cameras = lambda frame, a, b: tuple(sorted(self.cameras[frame, [a, b]].tolist()))
+        suspected = {cameras(*at) for at in np.argwhere(self.pairs)}
+        tried: dict[tuple[int, ...], list[_Trial]] = {}
+        for a, b in itertools.combinations(range(self.views.shape[1]), 2):
+            frames = np.flatnonzero(self.several[:, a] & self.several[:, b])
+            frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
+            if len(frames):
+                slots = [np.full(len(frames), slot) for slot in (a, b)]
+                for row, gain in enumerate(self.gains(frames, *slots).tolist()):
+                    one = _Trial(gain, frames[[row]], *(slot[[row]] for slot in slots))
+                    tried.setdefault(cameras(frames[row], a, b), []).append(one)
+        together = [_together(trials) for trials in tried.values()]
+        alone = [trial for trials in tried.values() if len(trials) > 1 for trial in trials]
+        every = np.ones(len(self.mirror), bool)
+        return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
+
+
+def _together(trials: Sequence[_Trial]) -> _Trial:
+    """Exchanges of two cameras in several frames as one."""
+    frames, a, b = (np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b"))
+    return _Trial(sum(trial.gain for trial in trials), frames, a, b)
 
 
 def _cameras(best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]) -> Swap:

@@ -266,8 +266,9 @@ def _gathered(
             plain, exchanged = (_error(views[v], each, points, known) for each in (row, row[mirror]))
             flipped = _is_exchanged(plain, exchanged)
             trials.append((exchanged if flipped else plain, (v, p), flipped))
-        if trials and min(trials)[0] < AGREE:
-            error, key, flipped = min(trials)
+        best = min(trials, default=None)
+        if best is not None and best[0] < AGREE:
+            error, key, flipped = best
             group[key] = flipped
             errors.append(error)
     return group, float(np.mean(errors))

@@ -27,11 +27,11 @@ def vertex_crosses(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f
     return np.stack([np.bincount(faces.T.ravel(), around[:, i], len(vertices)) for i in range(3)], axis=-1)
 
 
-def edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
+def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
     """Undirected edges (e, 2), and which of them each side, corner i to i + 1, of each face is (f, 3)."""
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
-    found, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
-    return found, index.reshape(faces.shape)
+    edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
+    return edges, index.reshape(faces.shape)
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
@@ -39,10 +39,10 @@ def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def directions_around(count: int) -> Float[np.ndarray, "d 3"]:
-    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice)."""
+def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3"]:
+    """Unit vectors, evenly spread over the sphere (a Fibonacci lattice), the first turned by `turned` golden angles."""
     i = np.arange(count)
-    y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * i
+    y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * (i + turned)
     radius = np.sqrt(1 - y * y)
     return np.stack([radius * np.cos(turn), y, radius * np.sin(turn)], axis=1)
 
@@ -53,12 +53,12 @@ def in_front(
     """Which of some points are at most `behind` behind the nearest of all points in their cell of a grid across `forward`."""
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])
-    every, own = frame @ points.T, frame @ some.T
-    (left, low), rows = every[:2].min(axis=1), int(np.ptp(every[1]) / cell) + 1
-    cells = lambda at: rows * ((at[0] - left) / cell).astype(int) + ((at[1] - low) / cell).astype(int)
-    nearest = np.full(cells(every).max() + 1, np.inf)
-    np.minimum.at(nearest, cells(every), every[2])
-    return own[2] < nearest[cells(own)] + behind
+    x, y, depths = frame @ np.concatenate([some, points]).T
+    column, row = (((values - values.min()) / cell).astype(int) for values in (x, y))
+    cells, count = column * (row.max() + 1) + row, len(some)
+    nearest = np.full(cells.max() + 1, np.inf)
+    np.minimum.at(nearest, cells[count:], depths[count:])
+    return depths[:count] < nearest[cells[:count]] + behind
 
 
 def smallest_turns(

@@ -6,12 +6,13 @@ metres. A vertex keeps them for every shape of the person, so one number fits al
 """
 
 import dataclasses
+import functools
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.surfaces import Boundaries, Faces, Points, Surface, blurred, boundaries, vertex_normals
+from humangs_jax.people.surfaces import Boundaries, Faces, Field, Points, Surface, blurred, boundaries, vertex_normals
 
 Rotations = Float[np.ndarray, "j 3"]
 """Rotation vectors of all joints, relative to their parents."""
@@ -274,12 +275,20 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     return result
 
 
-def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple) -> Anatomy:
-    """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
-    vertices, leg = np.asarray(vertices, np.float32), leg_membership(template)
+@functools.lru_cache(maxsize=1)
+def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
+    """Of the mean body: template, coordinates of cloth, membership of arms and legs."""
+    template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
-    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth_coordinates(template)}
+    return template, cloth_coordinates(template), arm, leg_membership(template)
+
+
+def measure(vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple) -> Anatomy:
+    """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
+    template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
+    vertices = np.asarray(vertices, np.float32)
+    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
     skin = Surface(vertices, faces, weights, attributes)
     levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)

@@ -60,7 +60,8 @@ def split_of(seed: int) -> str:
     for name, seeds in SPLITS.items():
         if seed in seeds:
             return name
-    raise ValueError(f"seed {seed} lies in no range: {SPLITS}")
+    ranges = ", ".join(f"{name} {seeds.start}..{seeds.stop - 1}" for name, seeds in SPLITS.items())
+    raise ValueError(f"seed {seed} lies in no range: {ranges}")
 
 
 def seeds_of(split: str, first: int, count: int) -> range:

@@ -80,11 +80,19 @@ def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, 
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _orbits(size: int, targets: Float[Array, "v 3"], *spherical: Float[Array, " v"]) -> Camera:
-    """A batch of cameras that each look at a target of their own. spherical: distances, azimuths, elevations."""
+def _orbits(
+    size: int,
+    targets: Float[Array, "v 3"],
+    distances: Float[Array, " v"],
+    azimuths: Float[Array, " v"],
+    elevations: Float[Array, " v"],
+) -> Camera:
+    """A batch of cameras that each look at a target of their own."""
     K = intrinsics_from_fov(VERTICAL_FOV, size, size)
-    one = lambda target, *place: orbit(target, *(x[None] for x in place), K, size, size)[0]
-    return jax.vmap(one)(targets, *spherical)
+    one = lambda target, distance, azimuth, elevation: orbit(
+        target, distance[None], azimuth[None], elevation[None], K, size, size
+    )[0]
+    return jax.vmap(one)(targets, distances, azimuths, elevations)
 
 
 def camera_from(
@@ -247,13 +255,21 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
 
 
 def _lights(
-    numpy: ModuleType, angles: Each, elevations: Each, power: Each, tint: Each, warmth: Number, *sky_ground_gain: Each
+    numpy: ModuleType,
+    angles: Each,
+    elevations: Each,
+    power: Each,
+    tint: Each,
+    warmth: Number,
+    sky: Each,
+    ground: Each,
+    gain: Each,
 ) -> Lights:
     """numpy: the module of the arrays' kind."""
     flat = numpy.cos(elevations)
     directions = numpy.stack([flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1)
     strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
-    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, *sky_ground_gain)))
+    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain)))
 
 
 def shaded_vertices(

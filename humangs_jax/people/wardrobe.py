@@ -105,7 +105,8 @@ def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment
     """The garments on the body. Each has random numbers of its own, spawned in order."""
     count = len(anatomy.skin.vertices)
     outfit = Outfit(anatomy, [], np.full(count, -1.0), np.zeros(count, bool), rng)
-    for garment, outfit.rng in zip(garments, rng.spawn(len(garments)), strict=True):
+    for garment, own in zip(garments, rng.spawn(len(garments)), strict=True):
+        outfit.rng = own
         BUILDERS.get(garment.kind, _accessory)(outfit, garment)
     outfit.pieces = [piece.visible() for piece in outfit.pieces]
     return outfit

@@ -191,7 +191,8 @@ def write_set(
                     listed = time.monotonic()
     finally:
         write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
-    for seed, error in failed.items():
+    if failed:
+        seed, error = next(iter(failed.items()))
         raise ValueError(f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}")
     return list(folders.values())
 

@@ -8,7 +8,7 @@ A rasterizer uses it in five steps, all with static shapes and none of them diff
 3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists of about the same length, and
    empty tiles come last and are never visited.
 4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of `tile_size`^2 values, row by row, at
-   `grid.offsets` from the tile's centre in `grid.centers`.
+   `grid.offsets` from the tile's centre.
 5. `tiles_to_image`.
 
 What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where the last row and column of

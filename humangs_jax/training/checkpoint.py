@@ -191,7 +191,8 @@ def _without_score(folder: Path) -> list[Path]:
     found = []
     for step in sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()):
         try:
-            float(read_json(step / "metrics" / "metrics")["score"])
+            if not isinstance(read_json(step / "metrics" / "metrics")["score"], int | float):
+                raise TypeError
         except (OSError, ValueError, LookupError, TypeError):
             found.append(step)
     return found

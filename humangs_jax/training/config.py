@@ -114,7 +114,7 @@ class TrainConfig:
         if self.model.runtime.dtype == "float16":
             raise ValueError("model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training")
         starts = [stage.start for stage in self.stages]
-        if starts != sorted(set(starts)) or starts[-1:] >= [self.steps]:
+        if starts != sorted(set(starts)) or (starts and starts[-1] >= self.steps):
             raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")
         for start in starts:
             self.at(start)

@@ -113,6 +113,12 @@ def bare_body(vertices, faces):
     return replace(body, template=jnp.asarray(vertices, jnp.float32), faces=jnp.asarray(faces, jnp.int32))
 
 
+def test_a_vertex_of_no_face_outside_of_all_faces_is_seen():
+    vertices, faces = sphere(rings=4)
+    for loose in ([0, 2.0, 0], [-3.0, -3, -3]):
+        assert exposure(np.concatenate([vertices, [loose]]), faces)[-1] > 0.5
+
+
 def test_a_body_without_collapses_finds_them():
     vertices, faces = sphere(rings=8)
     body = bare_body(vertices, faces)

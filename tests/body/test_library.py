@@ -158,11 +158,14 @@ def test_what_cannot_be_stored_or_read_is_an_error(tmp_path):
     np.savez(tmp_path / "part.npz", **arrays)
     with pytest.raises(ValueError, match=r"part\.npz: key 'template' is missing"):
         load_body(tmp_path / "part.npz")
+    np.savez(tmp_path / "pickled.npz", uvs=np.asarray([None]), **arrays)
+    with pytest.raises(ValueError, match=r"pickled\.npz: key 'uvs' cannot be read without pickles"):
+        load_body(tmp_path / "pickled.npz")
     np.savez(tmp_path / "newer.npz", **{**arrays, "format": np.asarray("humangs-body-9")})
     with pytest.raises(ValueError, match=r"newer\.npz: not a 'humangs-body-1' file"):
         load_body(tmp_path / "newer.npz")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         load_body(tmp_path / "nowhere.npz")
-    for arguments in ((), (tmp_path / "body.npz",)):
-        with pytest.raises(TypeError, match="shape_count"):
+    for arguments, words in (((), "to the shipped body"), ((tmp_path / "body.npz",), "body.npz")):
+        with pytest.raises(TypeError, match=f"{words}.*shape_count"):
             load_body(*arguments, shape_count=3)

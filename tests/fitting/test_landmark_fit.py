@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,7 @@ from humangs_jax.fitting.landmark_fit import fit_landmarks
 from humangs_jax.fitting.report import limit_violations
 from humangs_jax.fitting.residuals.keypoints import PLACE_STD, group_by_frame, keypoint_residuals, world_residuals
 from humangs_jax.fitting.state import pose_prior
+from humangs_jax.geometry.mesh import smallest_turns
 
 NAMES = list(POSES)
 EXACT_MM = 6.0
@@ -325,6 +328,15 @@ def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
     keypoints = read_keypoints(tmp_path / "keypoints.json", capture.names, 64, 64)
     observations, _ = group_by_frame(capture, keypoints)
     np.testing.assert_allclose(observations.world[:, 0], points, atol=1e-3)  # the file has tenths of a millimetre
+    few = [i for i, name in enumerate(MEDIAPIPE_33.names) if not name.endswith("hip")]
+    for rows in ([hips[0], few[0]], few):  # one hip is enough; without any it is the middle of what is seen
+        confidences = np.zeros((2, 33))
+        confidences[:, rows] = 1
+        own = group_by_frame(capture, dataclasses.replace(keypoints, confidences=confidences))[0].world
+        shown = keypoints.points[:, rows[:1] if hips[0] in rows else rows].mean(axis=1)
+        rays = np.column_stack([(shown - 32) / 100, np.ones(2)])
+        axes = smallest_turns(np.asarray([0.0, 0, 1]), rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        np.testing.assert_allclose(own[:, 0], np.einsum("nab,nkb->nka", axes, keypoints.world), atol=1e-5)
     one_moment = capture_from_arrays(
         np.ones((2, 64, 64, 3)), K, np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 55, 3)), np.zeros((1, 3)), frames=[0, 0]
     )

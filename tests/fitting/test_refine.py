@@ -20,10 +20,10 @@ from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, Score, refine
 from humangs_jax.fitting.residuals.silhouettes import (
     BodyView,
     body_boundary,
+    body_edges,
     distances,
     mask_boundary,
     match,
-    mesh_edges,
     silhouette_residuals,
     view_body,
 )
@@ -205,6 +205,18 @@ def test_settings_suit_what_is_known():
     assert bare.fixed_cameras and bare.std.clothing < 0.002 and bare.robust_scales[0] == bare.robust_scales[1]
 
 
+def test_keypoints_of_long_narrow_photos_are_where_they_are():
+    """At the size that is looked at, the height is 0.256 and the width, of whole pixels, 0.257 of the photo's."""
+    known, cameras = keypoints(), truth().cameras.resized(300, 2000)
+    known = dataclasses.replace(known, points=known.points * np.float32([300 / SIZE, 2000 / SIZE]))
+    images = np.broadcast_to(np.float32(0), (VIEWS, 2000, 300, 3))
+    capture = dataclasses.replace(truth(), images=images, masks=None, cameras=cameras)
+    scene = Scene(capture, known, CONFIG)
+    assert scene.score(capture).keypoints < 0.01
+    width, height = scene.cameras.width, scene.cameras.height
+    np.testing.assert_allclose(scene.observations.points[:, 0] / [width, height], known.points / [300, 2000], atol=1e-5)
+
+
 @pytest.mark.slow
 def test_keypoints_weigh_by_the_noise_that_the_body_finds():
     """A detector's bias of 6 pixels is no evidence of 0.8."""
@@ -240,7 +252,7 @@ def sphere():
 
 def boundary_of(sphere, camera):
     vertices, faces = sphere
-    return body_boundary(view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT)
+    return body_boundary(view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, body_edges(faces), COUNT)
 
 
 def disc(radius, x=SIDE / 2):
@@ -251,11 +263,11 @@ def disc(radius, x=SIDE / 2):
 
 def test_edges_of_a_tetrahedron_have_two_faces_each_and_of_a_triangle_one():
     tetrahedron = np.asarray([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
-    edges = mesh_edges(tetrahedron)
+    edges = body_edges(tetrahedron)
     assert len(edges.ends) == 6
     for ends, faces in zip(edges.ends, edges.faces, strict=True):
         assert set(faces) == {f for f in range(4) if set(ends) <= set(tetrahedron[f])} and len(set(faces)) == 2
-    assert set(mesh_edges(tetrahedron[:1]).faces[:, 1]) == {-1}
+    assert set(body_edges(tetrahedron[:1]).faces[:, 1]) == {-1}
 
 
 def test_a_sphere_s_boundary_is_the_circle_of_its_tangents(sphere):
@@ -291,7 +303,7 @@ def test_an_edge_before_the_body_is_no_boundary():
     image = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
     outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # normals of a flat mesh do not show its border
     image = BodyView(image.pixels, image.depths, outwards.astype(np.float32), image.covered)
-    boundary = body_boundary(image, faces, mesh_edges(faces), COUNT)
+    boundary = body_boundary(image, faces, body_edges(faces), COUNT)
     assert len(boundary.positions) == COUNT and boundary.ends.max() < 4
 
 

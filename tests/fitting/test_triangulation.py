@@ -10,11 +10,12 @@ from fit_people import model_of, observe, person
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import COCO_17, Keypoints
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, Keypoints, hand_names
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting import triangulation
+from humangs_jax.fitting.fit_capture import examine
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
-from humangs_jax.fitting.swaps import find_swaps
+from humangs_jax.fitting.swaps import find_exchanged_hands, find_swaps
 from humangs_jax.fitting.triangulation import (
     Match,
     Seen,
@@ -286,6 +287,29 @@ def test_one_view_and_views_that_are_missing():
     assert [swap.views for swap in swaps] == [("m2v2",)]
     blind = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
     assert found(capture, blind) == ()
+
+
+def test_hands_at_each_others_wrists():
+    capture, keypoints = person(0, 1, 3, kind=COCO_WHOLEBODY_133)
+    assert find_exchanged_hands(keypoints, capture.names) == ()
+    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
+    points = keypoints.points.copy()
+    points[2, hands] = points[2, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
+    exchanged = dataclasses.replace(keypoints, points=points)
+    (swap,) = find_exchanged_hands(exchanged, capture.names)
+    assert str(swap) == "view m0v2: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    assert find_exchanged_hands(person(0, 1, 2)[1], capture.names) == ()
+
+
+@pytest.mark.slow
+def test_where_hands_are_exchanged_the_body_is_right():
+    capture, keypoints = person(0, 1, 3, kind=COCO_WHOLEBODY_133)
+    hands = [i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))]
+    points = keypoints.points.copy()
+    points[2, hands] = points[2, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
+    exchanged = dataclasses.replace(keypoints, points=points)
+    assert [swap.kind for swap in found(capture, exchanged)] == ["sides"]
+    assert [swap.kind for swap in examine(capture, exchanged).report.swaps] == ["hands"]
 
 
 # People of several views are told apart by how their landmarks triangulate --------------------------------------------

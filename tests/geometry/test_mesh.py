@@ -50,3 +50,6 @@ def test_directions_are_spread_and_what_is_behind_is_not_seen():
         both = np.concatenate([wall, wall + forward])
         seen = in_front(both, both, forward, 0.9, 0.5)
         assert seen[: len(wall)].all() and not seen[len(wall) :].any()
+        beside = np.asarray([[-9.0, 2, 5], [20, 2, 5], [3, -9, 5], [3, 20, 5]]) * [1, 1, forward[2]]
+        assert in_front(beside, wall, forward, 0.9, 0.5).all()  # nothing is before them
+        assert not in_front(np.concatenate([beside, wall + forward]), wall, forward, 0.9, 0.5)[4:].any()

@@ -1,6 +1,8 @@
 """Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped, and their residuals."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -62,8 +64,9 @@ def make_observations(
     return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
 
 
-def scaled_observations(cameras: Camera, keypoints: Keypoints, scale: float) -> Observations:
-    """Keypoints of images of another scale: a batch of views, each with one view (c = 1), and the noise of all."""
+def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
+    """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c = 1), and the noise of all."""
+    scale = np.asarray([cameras.width / photos.width, cameras.height / photos.height])
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
     arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
     noise = expected_noise(points[None], keypoints.confidences[None])
@@ -82,8 +85,9 @@ def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Obse
     cameras = photos.cameras
     world = None
     if keypoints.world is not None and views.shape[1] == 1:  # several views say more than any of them alone
-        K = np.asarray(cameras.K)[views]
-        world = in_camera_axes(keypoints.world[views], points, confidences, K, keypoints.set.names)
+        hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
+        middle = np.where((confidences * hips).any(-1, keepdims=True), confidences * hips, confidences)
+        world = in_camera_axes(keypoints.world[views], points, middle, np.asarray(cameras.K)[views])
     return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views], world), views
 
 
@@ -92,13 +96,8 @@ def in_camera_axes(
     points: Float[np.ndarray, "*b k 2"],
     weights: Float[np.ndarray, "*b k"],
     K: Float[np.ndarray, "*b 3 3"],
-    names: tuple[str, ...],
 ) -> Float[np.ndarray, "*b k 3"]:
-    """Landmarks in the axes of the camera, from those of a detector whose z axis is the ray to the middle of the hips, or where
-    they are not seen to that of all points.
-    """
-    hips = np.asarray([kind_of(name) == "hip" for name in names])
-    weights = np.where((weights > 0).all(-1, where=hips, keepdims=True), weights * hips, weights)
+    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the camera."""
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
     focal, center = np.diagonal(K, axis1=-2, axis2=-1)[..., :2], K[..., :2, 2]
@@ -142,13 +141,18 @@ def keypoint_errors(observations: Observations, landmarks: Float[Array, "k 3"]) 
     return pixels + observations.K[:, None, :2, 2] - observations.points
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="errors")
 def body_errors(
-    model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose, seen: Observations, frames: Int[Array | np.ndarray, " n"]
-) -> Float[Array, "n c k 2"]:
-    """`keypoint_errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
+    model: LandmarkModel,
+    betas: Float[Array, " s"],
+    poses: BodyPose,
+    seen: Observations,
+    frames: Int[Array | np.ndarray, " n"],
+    errors: Callable[[Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]] = keypoint_errors,
+) -> Float[Array, "n c k ..."]:
+    """`errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
-    return jax.vmap(keypoint_errors)(seen, landmarks[frames])
+    return jax.vmap(errors)(seen, landmarks[frames])
 
 
 TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from humangs_jax.body.model import BodyModel, SurfacePoints, surface_points
 from humangs_jax.core.array_types import Array, Bool, Float, Int
@@ -26,7 +25,8 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.state import robust
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.mesh import edges, unit
+from humangs_jax.geometry.mesh import mesh_edges, unit
+from humangs_jax.network.maps import sample_bilinear
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 PROBE = 1.5
@@ -73,9 +73,9 @@ class Boundary:
     shares: Float[np.ndarray, " p"] | None = None
 
 
-def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
+def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
     """All edges of a mesh; of more than two faces that share an edge, two are kept."""
-    ends, sides = edges(faces)
+    ends, sides = mesh_edges(faces)
     edge, owner = sides.ravel(), np.repeat(np.arange(len(faces)), 3)
     beside = np.full((len(ends), 2), -1)
     beside[edge, 0] = owner  # the last of an edge's faces; then the first
@@ -201,7 +201,7 @@ def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) 
     """For points of the body, along their normals: where the mask goes from inside to outside."""
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
-    covered = map_coordinates(mask, np.moveaxis(places[..., ::-1], -1, 0) - 0.5, order=1, mode="nearest")
+    covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
     seen = inside_image(places, mask.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
     nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
@@ -211,6 +211,11 @@ def _ends_of_mask(body: Boundary, mask: Float[np.ndarray, "h w"], reach: float) 
     along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(found, inner - outer, 1.0)
     offsets = np.sum(body.normals * body.positions, axis=-1) + along
     return np.flatnonzero(found), body.normals[found], offsets[found]
+
+
+@jax.jit
+def _coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
+    return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
 
 
 def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
