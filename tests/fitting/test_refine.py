@@ -214,7 +214,9 @@ def test_keypoints_of_long_narrow_photos_are_where_they_are():
     scene = Scene(capture, known, CONFIG)
     assert scene.score(capture).keypoints < 0.01
     width, height = scene.cameras.width, scene.cameras.height
-    np.testing.assert_allclose(scene.observations.points[:, 0] / [width, height], known.points / [300, 2000], atol=1e-5)
+    np.testing.assert_allclose(
+        np.asarray(scene.observations.points)[:, 0] / [width, height], known.points / [300, 2000], atol=1e-5
+    )
 
 
 @pytest.mark.slow
