@@ -41,7 +41,9 @@ PROGRAM = re.compile(r"(?:.*/)?(humangs|python3?)$")
 
 
 class Command(NamedTuple):
-    """words: without prompt and program before it, placeholders as they stand. whole: of a block; others may lack arguments."""
+    """words: without prompt and program before it, placeholders as they stand. whole: of a block, or the beginning of an item of
+    a list; others may lack arguments.
+    """
 
     page: str
     words: tuple[str, ...]
@@ -73,8 +75,10 @@ def commands_in(text, page):
     for block in FENCE.finditer(text):
         if block["kind"].lower() in SHELLS:
             found += [Command(page, words, True) for words in split_shell(block["text"])]
-    for span in SPAN.finditer(FENCE.sub("", text)):
-        found += [Command(page, words, False) for words in split_shell(" ".join(span["text"].split()))]
+    prose = FENCE.sub("", text)
+    for span in SPAN.finditer(prose):
+        item = prose[: span.start()].endswith(("\n- ", "\n* "))
+        found += [Command(page, words, item) for words in split_shell(" ".join(span["text"].split()))]
     return list(dict.fromkeys(found))
 
 
@@ -148,7 +152,9 @@ def refused(command):
     """None, or why a line of a page cannot be typed: what the parser says; of a span, a name or an option that does not exist."""
     name, *words = filled(command.words[1:])
     if not command.whole:
-        known = option_names(cli._command(name)) if name in cli.COMMANDS else ()
+        if name not in cli.COMMANDS:
+            return None if name.startswith("-") else f"{name} is no command"
+        known = option_names(cli._command(name))
         return [word for word in words if word.startswith("--") and word.split("=")[0] not in known] or None
     printed = io.StringIO()
     try:
@@ -213,10 +219,13 @@ def test_blocks_are_whole_and_spans_are_not():
     assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == ["1", "--up=+z", "integer", "1/x.npz"]
 
 
-@pytest.mark.parametrize("words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos"])
+@pytest.mark.parametrize(
+    "words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos", "trian DATA"]
+)
 def test_a_wrong_line_is_noticed(words):
     assert refused(Command("page", ("humangs", *words.split()), True))
     assert refused(Command("page", ("humangs", "train", "--vgg-19"), False))
+    assert refused(Command("page", ("humangs", "trian", "--out"), False))
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def test_people_of_one_color_are_not_mixed_in_silence(tmp_path):
     assert (tmp_path / "people.png").is_file()
 
 
-def test_what_is_written_is_of_the_person_and_of_everybody(tmp_path):
+def test_keypoints_and_masks_are_those_of_the_person_and_the_picture_shows_everybody(tmp_path):
     photos = same_people([photo("x/a.jpg", found(1, 90.0), found(2, 20.0)), photo("b.jpg")])
     write_found(tmp_path, photos, 1)
     kept = read_keypoints(tmp_path / "keypoints.json", ("x_a", "b"), *SIZE)

@@ -86,9 +86,10 @@ def test_the_blocks_of_the_readme_run(whole, monkeypatch, tmp_path, body):
     image, capture = np.asarray(names["image"]), names["capture"]
     assert image.shape == capture.images[0].shape and image.dtype == np.float32
     error = image - np.asarray(capture.images[0])
-    assert -10 * np.log10(np.mean(error**2)) > LEAST_PSNR or not whole
+    if whole:
+        assert -10 * np.log10(np.mean(error**2)) > LEAST_PSNR
+        assert float(np.abs(names["gradient"].colors).max()) > 0
     assert len(names["gaussians"].means) == len(names["avatar"].gaussians.means)
-    assert float(np.abs(names["gradient"].colors).max()) > 0 or not whole
     assert names["ablation"] != names["config"]
 
 

@@ -105,6 +105,7 @@ SMALL = Case("small", "foreground", "visible", remat=True, train=True, scan=True
 FAST = (PUBLISHED, SMALL)
 SLOW = [
     Case("published", "foreground", "visible", remat=True),
+    Case("published", "all", "visible", remat=True, train=True),
     Case("small", "all", "all", remat=True, train=True, scan=True),
     *(Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")),
 ]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from humangs_jax.avatar.export.gaussians import (
     rotated,
     turned,
 )
-from humangs_jax.avatar.export.splats import write_glb, write_ply, write_spz
+from humangs_jax.avatar.export.splats import write_glb, write_ply, write_splat, write_spz
 from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported
@@ -303,3 +304,28 @@ def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
             array, other = array / np.abs(array).max(), other / np.abs(array).max()
         tolerance = SPZ_LOSSES.get(attribute.removeprefix(PREFIX), 2e-6) if name == "a.spz" else 2e-6
         np.testing.assert_allclose(other, array, atol=tolerance, err_msg=attribute)
+
+
+def test_gsply_reads_our_spz(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="needs gsply (PyPI)")
+    gaussians = random_gaussians()
+    write_spz(tmp_path / "a.spz", gaussians)
+    ours, theirs = load_gaussians(tmp_path / "a.spz"), gsply.read_spz(str(tmp_path / "a.spz"))
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-6)
+    np.testing.assert_allclose(np.exp(theirs.scales), ours.scales, rtol=1e-5)
+    np.testing.assert_allclose(theirs.quats, ours.quats, atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-theirs.opacities)), ours.opacities, atol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * theirs.sh0, ours.colors, atol=1e-5)
+
+
+@pytest.mark.slow
+@needs_npm
+def test_splat_transform_reads_our_splat(tmp_path):
+    gaussians = random_gaussians()
+    write_splat(tmp_path / "a.splat", gaussians)
+    transformed(tmp_path / "a.splat", tmp_path / "b.ply")
+    back = load_gaussians(tmp_path / "b.ply")
+    nearest = [int(np.argmin(np.linalg.norm(back.means - mean, axis=1))) for mean in np.asarray(gaussians.means)]
+    np.testing.assert_allclose(back.means[jnp.asarray(nearest)], gaussians.means, atol=1e-5)
+    covariance, opacity, color = off_by(gaussians, jax.tree.map(lambda x: x[jnp.asarray(nearest)], back))
+    assert covariance < 0.05 and max(opacity, color) < 0.003

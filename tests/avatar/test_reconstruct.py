@@ -231,6 +231,13 @@ def test_light_shines_from_above_in_a_capture_of_another_world(body):
         np.testing.assert_allclose(got, expected, atol=TURNED)
 
 
+def test_people_who_lie_before_upright_cameras_are_left_lying(body):
+    """The person alone says nothing about the world; that of captures has y up."""
+    views = standardize(capture(body, SIZE, SIZE), SIZE)
+    lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
+    assert lying.upright(body) is lying
+
+
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     """The masks say where the person is; the pixel at which a camera shows a point has the same color before and after."""
     photos = capture(body, 48, 36)

@@ -188,3 +188,14 @@ def test_ffmpeg_failing_is_an_error(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"ffmpeg failed: .*no number"):
         write_video(tmp_path / "a.mp4", moving_square(200), 24)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
+def test_an_interruption_leaves_nothing(tmp_path, name):
+    def drawn():
+        yield from moving_square(5)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / name, drawn(), 24)
+    assert list(tmp_path.iterdir()) == []

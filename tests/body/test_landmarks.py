@@ -78,7 +78,8 @@ def test_left_and_right_are_mirror_images(body, whole):
     for points in (whole[1], dict(zip(model.names, at_rest(model), strict=True))):
         for name, point in points.items():
             assert np.linalg.norm(point - points[mirrored_name(name)] * [-1, 1, 1]) < SYMMETRY, name
-            assert point[0] >= 0 or not name.startswith("left_"), name
+            side = {"left": 1, "right": -1}.get(name.split("_")[0], 0)
+            assert side * point[0] > 0 or not side, name
 
 
 @pytest.mark.slow

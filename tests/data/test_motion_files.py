@@ -22,8 +22,8 @@ from joblib_files import joblib
 from torch_writer import FakeTensor, write_checkpoint, write_stream
 
 FRAMES = 6
-SINGLE, MATRICES, NEAR_BONES = 1e-5, 2e-5, 0.06
-"""Radians and metres: float32; of matrices in float32; of bones whose twists are taken out (radians between directions: 0)."""
+SINGLE, MATRICES = 1e-5, 2e-5
+"""Radians and metres: float32; of matrices in float32."""
 HEAD = JOINT_NAMES.index("head")
 
 

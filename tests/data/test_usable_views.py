@@ -147,6 +147,15 @@ def test_repeated_photos_are_left_out(demo):
     assert 2 in chosen and len(set(chosen)) == 2
 
 
+def test_a_photo_without_the_person_is_not_chosen(demo):
+    views = demo.select(range(4))
+    empty = views.masks.copy()
+    empty[1] = 0
+    empty[1, :8, :8] = 1  # an empty mask would be no mask
+    chosen = select_views(dataclasses.replace(views, masks=empty), 3)
+    assert chosen == [0, 2, 3]
+
+
 def test_few_photos_are_all_taken_and_none_is_refused(demo):
     assert select_views(demo.select(range(3)), 5) == [0, 1, 2]
     with pytest.raises(ValueError, match="at least 1 photo, got 0"):

@@ -78,7 +78,7 @@ def test_keypoints_with_noise_give_it_within_the_limits_of_joints(noisy):
     assert (np.abs(np.asarray(fit.noise) - 2.0) < 0.5).all()
     some = np.asarray([NAMES.index("standing"), NAMES.index("crouching")])
     within = jax.tree.map(lambda leaf: leaf[some], fit.poses)
-    assert all(each.degrees < 9 for each in limit_violations(model_of().joint_names, within))
+    assert all(each.degrees < np.degrees(0.15) for each in limit_violations(model_of().joint_names, within))
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ def test_clothes_are_outside(body, truth, tmp_path):
 
 
 @pytest.mark.slow
-def test_results_are_written_whole(bare, truth, tmp_path):
+def test_results_are_written_whole(bare, tmp_path):
     save_scan_fit(tmp_path / "fit", bare)
     arrays, pickled = read_npz(tmp_path / "fit" / "body.npz")
     assert arrays["rotations"].shape == (1, 55, 3) and arrays["translations"].shape == (1, 3) and not pickled

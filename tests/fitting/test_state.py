@@ -5,7 +5,7 @@ import numpy as np
 
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
-from humangs_jax.fitting.state import MIRROR, camera_origin, pose_prior
+from humangs_jax.fitting.state import MIRROR, camera_origin, limit_residuals, pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 
@@ -26,3 +26,10 @@ def test_right_joints_are_mirror_images_of_left_ones_and_unknown_ones_have_no_li
         ends = np.sort([prior.lower[left] * MIRROR, prior.upper[left] * MIRROR], axis=0)
         np.testing.assert_array_equal([prior.lower[right], prior.upper[right]], ends.astype(np.float32))
     assert np.array_equal(prior.mean[-1], np.zeros(3)) and prior.upper[-1].min() > 3.1
+
+
+def test_a_tenth_of_a_radian_beyond_a_limit_is_two_standard_deviations_and_nothing_inside_counts():
+    prior, knees = pose_prior(JOINT_NAMES), tuple(JOINT_NAMES.index(f"{side}_knee") for side in ("left", "right"))
+    rotations = jnp.asarray(prior.mean).at[knees[0]].set(prior.upper[knees[0]] + np.float32([0.1, 0, -0.01]))
+    rotations = rotations.at[knees[1], 1].set(prior.lower[knees[1], 1] - 0.1)
+    np.testing.assert_allclose(limit_residuals(prior, knees, rotations), [[2, 0, 0], [0, 2, 0]], atol=1e-5)

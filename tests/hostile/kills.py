@@ -52,7 +52,7 @@ def run_undisturbed(command: Command, place: Path, kept: Path, inputs: Path) -> 
 
 
 def disturb(command: Command, folder: Path, inputs: Path, count: int, interrupt: bool) -> dict:
-    """Kills or interrupts a command at `count` moments. Returns figures and faults."""
+    """Disturbs a command at `count` moments, some of which its end comes before. Returns figures and faults."""
     began, hit, left = time.monotonic(), 0, 0
     place, kept = writers.place_of(command, folder, inputs, "disturbed"), folder / "before"
     before, undisturbed, expected = run_undisturbed(command, place, kept, inputs)

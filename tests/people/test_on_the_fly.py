@@ -36,7 +36,7 @@ MIRRORED = 0.96
 """Share of the body's pixels inside the mask; left and right of the body differ by up to 5 mm, edges by a pixel."""
 NEARER = 0.85
 """Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm. Up to 2.5 cm may be left
-everywhere (`INSET`). Measured: 0.66 and 0.75."""
+everywhere (`Reach.inset`). Measured: 0.66 and 0.75."""
 LIKE_RENDERED = 30
 """PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at folds. Measured 34 or more."""
 

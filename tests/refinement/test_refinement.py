@@ -48,7 +48,7 @@ def test_a_share_that_holds_nothing_out_keeps_the_last_state(person):
     assert report.kept and report.loss[1] < 0.8 * report.loss[0]
 
 
-def test_what_no_photo_sees_stays(body, person):
+def test_what_no_photo_sees_stays(person):
     avatar, capture = person
     hidden = replace(avatar.gaussians, opacities=avatar.gaussians.opacities.at[:50].set(0.0))
     refined = refinement.refine(replace(avatar, gaussians=hidden), capture, STEPS)
@@ -132,7 +132,7 @@ def test_interruption_returns_the_best_state(person, monkeypatch):
 
 
 @pytest.mark.slow
-def test_pure_function_maps_over_people(body, person):
+def test_pure_function_maps_over_people(person):
     avatar, capture = person
     views = crop_to_person(capture)
     other = replace(avatar, gaussians=replace(avatar.gaussians, colors=1 - avatar.gaussians.colors))
@@ -197,7 +197,7 @@ def test_wrong_settings_are_named(settings, named):
         RefineConfig(**settings)
 
 
-def test_wrong_captures_are_named(body, person):
+def test_wrong_captures_are_named(person):
     avatar, capture = person
     with pytest.raises(ValueError, match="0 views"):
         refinement.refine(avatar, capture.select([]))

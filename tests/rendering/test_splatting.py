@@ -119,6 +119,33 @@ def test_an_image_in_bands_is_the_image(most):
 
 
 @pytest.mark.slow
+def test_gradients_are_derivatives():
+    """Central differences, with decisions that do not flip at this seed and no alpha at the clamp."""
+    with jax.enable_x64(True):
+        gaussians, step = random_gaussians(11), 1e-6
+        gaussians = replace(gaussians, opacities=gaussians.opacities.at[:15].multiply(0.9))
+        arguments = gaussians, camera(), background()
+        gradients = tiled(*arguments)[1]
+        rng = np.random.default_rng(3)
+        weights = loss_weights()
+
+        def loss(arguments):
+            r = tiled(*arguments)[0]
+            return sum(float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
+
+        leaves, structure = jax.tree.flatten(arguments)
+        slopes = jax.tree.leaves(gradients)
+        assert [a.shape for a in leaves] == [a.shape for a in slopes]
+        for i, slope in enumerate(slopes):
+            direction = jnp.asarray(rng.normal(size=slope.shape))
+            moved = [
+                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]]) for s in (step, -step)
+            ]
+            difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
+            np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)], ids=["default", "tile 5"])
 def test_the_schedule_does_not_change_the_image(config):
     with jax.enable_x64(True):

@@ -72,7 +72,7 @@ def test_a_larger_mask_shows_the_background_there_alone(photos):
     np.testing.assert_array_equal(np.asarray(images)[np.asarray(masks) == 0], 1)
 
 
-def test_exposure_has_its_standard_deviation(photos):
+def test_exposure_has_its_standard_deviation():
     grey = jnp.full((2000, 1, 1, 3), 0.3), jnp.ones((2000, 1, 1))
     images, _ = changed(2, *grey, dataclasses.replace(NOTHING, exposure=0.1))
     gains = np.log(np.asarray(images)[:, 0, 0] / 0.3)

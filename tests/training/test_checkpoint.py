@@ -1,6 +1,7 @@
 """Checkpoints: bit for bit, the newest and the best, and never those of another run."""
 
 import dataclasses
+import os
 import shutil
 
 import jax
@@ -63,12 +64,20 @@ def test_keeps_the_newest_and_the_best(tmp_path, checkpoints, same):
     again.close()
 
 
+def largest_file(step):
+    return max((step / "default").rglob("d/*"), key=lambda path: path.stat().st_size)
+
+
 def flip_a_bit(step):
     """Of a number: only the checksum sees that."""
-    file = max((step / "default").rglob("d/*"), key=lambda path: path.stat().st_size)
+    file = largest_file(step)
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 4
     file.write_bytes(data)
+
+
+def cut_off(step):
+    os.truncate(largest_file(step), 40)
 
 
 def empty(step):
@@ -102,7 +111,7 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, 
     for step in (1, 2, 3):
         first.save(state_at(step, LARGE))
     first.close()
-    for damage in (flip_a_bit, empty, without_numbers, without_score):
+    for damage in (flip_a_bit, cut_off, empty, without_numbers, without_score):
         folder = tmp_path / damage.__name__
         shutil.copytree(tmp_path / "whole", folder)
         damage(folder / "3")

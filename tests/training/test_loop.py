@@ -42,13 +42,15 @@ def whole(run, tmp_path_factory):
 
 
 def losses(out):
-    return {line["step"]: line["loss"] for line in lines(out) if "loss" in line}
+    """(step, loss) of every line, in order."""
+    return [(line["step"], line["loss"]) for line in lines(out) if "loss" in line]
 
 
 @pytest.mark.slow
 def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(run, tmp_path, whole, same):
     assert int(run(tmp_path, stop_at=2).step) == 2
     assert same(run(tmp_path, stop_at=4), whole[0]) and losses(tmp_path) == losses(whole[1])
+    assert len(losses(tmp_path)) == 4
     before = len(lines(tmp_path))
     assert same(run(tmp_path, stop_at=4), whole[0]) and len(lines(tmp_path)) == before  # there is nothing left to do
 
@@ -57,7 +59,7 @@ def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(run, tmp_p
 def test_a_finished_run_goes_on_when_it_gets_more_steps(run, tmp_path):
     for steps in (2, 3):
         run(tmp_path, dataclasses.replace(CONFIG, steps=steps), validation=())
-    assert list(losses(tmp_path)) == [1, 2, 3]
+    assert [step for step, _ in losses(tmp_path)] == [1, 2, 3]
 
 
 @pytest.mark.slow
