@@ -177,7 +177,7 @@ def stand_ins(variant):
     def fitted(photos, *_, **__):
         record = some_record(variant, photos.names)
         capture = moved(some_capture(0, len(photos.names), 32))
-        return SimpleNamespace(capture=capture, record=record, report=FitReport("keypoints"))
+        return SimpleNamespace(capture=capture, record=record, report=FitReport("keypoints"), camera_errors=())
 
     def converted(*_):
         return SimpleNamespace(variables=some_variables(), config=tiny(), skipped=1)
@@ -201,6 +201,7 @@ def stand_ins(variant):
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: Faults((), (None,) * capture.view_count, (1.0,) * capture.view_count, set()),
         "apps.check._posed_frames": lambda capture, *_: {0: np.zeros((4, 3))},
+        "apps.start.better_body": lambda _weights, _config, loose, *_: (loose, None),
         "apps.demo.load_weights": lambda *_: (None, tiny()),
         "apps.demo.reconstruct": avatar,
         "apps.demo.animate": lambda avatar, _: avatar.gaussians,

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -276,6 +277,24 @@ def test_places_where_nothing_can_be_written_are_refused_before_the_work(tmp_pat
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     with pytest.raises(ValueError, match="cannot be written to"):
         atomic.check_replaceable(tmp_path / "deep" / "folder")
+
+
+def test_several_writers_of_one_folder_end_with_one_of_theirs(tmp_path):
+    failed, target = [], tmp_path / "folder"
+
+    def write(number):
+        try:
+            for _ in range(20):
+                atomic.replace_folder(target, writes(str(number)), mark=MARK)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == [] and names(tmp_path) == ["folder"] and (target / "a.txt").read_text() in "0123"
 
 
 WRITE_FOR_EVER = """
