@@ -47,7 +47,7 @@ def test_type_checkers_know_what_everything_is(tmp_path):
     names = [*re.findall(r"^(\w+)(?:, (\w+))? =", USER, re.MULTILINE), *((f"hg.{name}", "") for name in USED)]
     shown = [f"reveal_type({name})" for pair in names for name in pair if name]
     (tmp_path / "user.py").write_text("\n".join([USER, *shown, "hg.render(avatar)"]))
-    command = ["ty", "check", "--python", sys.prefix, "--output-format", "concise", "user.py"]
+    command = [sys.executable, "-m", "ty", "check", "--python", sys.prefix, "--output-format", "concise", "user.py"]
     text = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
     arrays_of_numpy = "ndarray[tuple[Any, ...], dtype[Any]]"
     types = [each.replace(arrays_of_numpy, "ndarray") for each in re.findall(r"Revealed type: `(.*)`", text)]

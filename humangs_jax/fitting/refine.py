@@ -259,10 +259,8 @@ class Scene:
         known = ((),) if kind is None else (kind.names, kind.places, kind.certainty)
         self.model = landmark_model(capture.body, *known)
         self.scale = self.cameras.width / capture.cameras.width
-        sizes = (capture.cameras, self.cameras)
-        self.keypoints, self.observations = (
-            None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras) for cameras in sizes
-        )
+        seen_by = lambda cameras: None if keypoints is None else scaled_observations(cameras, keypoints, capture.cameras)
+        self.keypoints, self.observations = seen_by(capture.cameras), seen_by(self.cameras)
         self.height = _person_height(self.masks, self.observations)
         self.origin = capture_origin(capture, self.cameras, config)
 

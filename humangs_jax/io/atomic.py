@@ -216,7 +216,7 @@ def add_files(
     The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
     falls between two, and those of two processes do not mix. The folder may be a mount point or the working folder.
 
-    Arguments: without: files in the folder that no longer hold; they are removed before the first move.
+    Arguments: without: files in the folder that are out of date; those that are not replaced are deleted after the last move.
     Raises: OSError, naming `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
@@ -232,12 +232,12 @@ def add_files(
         with undisturbed():
             folder.mkdir(exist_ok=True)
             with _locked(folder, wait=True):
-                for file in without:
+                new = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
+                for file in new:
+                    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                    (temporary / file).replace(folder / file)
+                for file in {Path(file) for file in without}.difference(new):
                     (folder / file).unlink(missing_ok=True)
-                for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
-                    target = folder / file.relative_to(temporary)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(target)
 
 
 @contextlib.contextmanager

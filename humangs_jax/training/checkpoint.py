@@ -191,10 +191,10 @@ def _without_score(folder: Path) -> list[Path]:
     found = []
     for step in sorted(path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()):
         try:
-            if not isinstance(read_json(step / "metrics" / "metrics")["score"], int | float):
-                raise TypeError
+            readable = isinstance(read_json(step / "metrics" / "metrics")["score"], int | float)
         except (OSError, ValueError, LookupError, TypeError):
-            found.append(step)
+            readable = False
+        found += [] if readable else [step]
     return found
 
 

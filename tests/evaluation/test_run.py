@@ -185,7 +185,7 @@ def test_what_is_wrong_is_one_line(people, folders, tmp_path):
         hg.evaluate(folders, avatar=tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"no prediction was found; 2 were expected: .*ann\.npz"):
         hg.evaluate(folders, avatar=theirs)
-    with pytest.raises(KeyError, match="no preset 'ours': expected one of humangs, animatable-gaussians"):
+    with pytest.raises(ValueError, match="no protocol 'ours': expected one of humangs, animatable-gaussians"):
         hg.evaluate(folders, predictions=theirs, protocol="ours")
     masks = capture_from(people["ann"][0].images)
     with pytest.raises(ValueError, match="ann: the protocol needs a mask for every view"):

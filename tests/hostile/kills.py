@@ -1,5 +1,5 @@
-"""Kills commands that write at random moments: python kills.py FOLDER [--count 10] [--json FILE] [COMMAND ...]
-Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts [--count 10] [--json FILE] [COMMAND ...]
+"""Kills commands that write at random moments: python kills.py FOLDER [COMMAND ...] [--count 10] [--json FILE]
+Interrupts them instead, as Ctrl-C does: python kills.py FOLDER [COMMAND ...] --interrupts [--count 10] [--json FILE]
 
 A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, until a second after one, or
 at any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody

@@ -1,5 +1,6 @@
 """Files and folders appear whole or not at all, and what was there before is never lost."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -110,6 +111,29 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
     with pytest.raises(Interrupted):
         atomic.replace_folder(folder, writes("new"), mark=MARK)
     assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "old"
+
+
+@pytest.mark.parametrize("moves", [0, 1, 2])
+def test_an_interrupt_between_moves_deletes_no_old_file(tmp_path, monkeypatch, moves):
+    """Files that are out of date go last: a process that is killed before leaves the old or the new of each name."""
+    old, new = ("a.png", "b.png", "c.png"), ("a.png", "b.png")
+    for name in old:
+        (tmp_path / name).write_text("old")
+    replace, moved = Path.replace, []
+
+    def interrupted(self, target):
+        if len(moved) == moves:
+            raise Interrupted
+        moved.append(target)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    write = lambda folder: [(folder / name).write_text("new") for name in new]
+    with pytest.raises(Interrupted) if moves < 2 else contextlib.nullcontext():
+        atomic.add_files(tmp_path, write, without=old)
+    texts = {name: (tmp_path / name).read_text() for name in names(tmp_path)}
+    expected = {name: "new" if i < moves else "old" for i, name in enumerate(old)}
+    assert texts == (expected if moves < 2 else dict.fromkeys(new, "new"))
 
 
 def test_an_interrupt_while_the_old_folder_is_deleted_leaves_nothing_of_it(tmp_path, monkeypatch):
