@@ -214,7 +214,7 @@ class BodyModel:
     """Of progressive decimation, with `collapse_into`: `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
     spacing: Float[Array, " n"] | None = None
-    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.subdivision`."""
+    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`."""
     texels: Texels | None = None
     """A map of the surface, for networks that work on one: `network.parts`."""
     parents: tuple[int, ...] = static_field(default=())

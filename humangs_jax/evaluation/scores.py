@@ -292,7 +292,7 @@ def person_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
-    """psnr_fg, psnr_outline (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
+    """psnr_fg, psnr_boundary (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
 
     mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that counts their scores are NaN.
     """

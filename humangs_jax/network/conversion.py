@@ -147,7 +147,7 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
-    """Tensors of a checkpoint in any format of `tensor_file`, and how many of the loss networks were skipped.
+    """Tensors of a checkpoint in any format of `io.tensors`, and how many of the loss networks were skipped.
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """

@@ -169,7 +169,7 @@ class PeopleBank:
     faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
     face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
     alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
-    texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
+    texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
     displacements: (p, b, 3) of a body's vertices to the silhouettes of the dressed person (`data.body_and_masks`), metres;
     b is 0 in a bank without.
