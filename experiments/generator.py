@@ -1,4 +1,4 @@
-"""Synthetic people: what is wrong with them, how much they differ, contact sheets."""
+"""Synthetic people: what is wrong with them, contact sheets."""
 
 import functools
 from pathlib import Path
@@ -13,7 +13,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.people import anatomy, surroundings
-from humangs_jax.people.subject import DEMO, describe, make_subject, padded, pose_subject, render_view
+from humangs_jax.people.subject import DEMO, make_subject, padded, pose_subject, render_view
 from humangs_jax.people.writer import sample_motion, sample_pose
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
@@ -64,36 +64,6 @@ def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
     return {"pixels": float(pixels)} | {name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)}
 
 
-@entry
-def people_diversity(run: Run, people: int = 1000) -> None:
-    """How much synthetic people differ, by their descriptions. Seconds.
-
-    Options:
-    people: how many, of the training seeds
-    """
-    body = load_body()
-    described = [describe(seed, body) for seed in range(people)]
-    betas, marks = np.stack([p.betas for p in described]), {}
-    spreads = {
-        "stature, m": ([p.stature for p in described], 2),
-        "years": ([p.years for p in described], 0),
-        "weight coefficient": (betas[:, body.shape_names.index("weight")], 2),
-        "muscle coefficient": (betas[:, body.shape_names.index("muscle")], 2),
-        "brightness of the skin": ([p.complexion.skin.mean() for p in described], 2),
-        "garments and accessories": ([len(p.garments) for p in described], 1),
-    }
-    header, table = ["mean", "standard deviation", "least", "5 %", "median", "95 %", "most"], []
-    for name, (values, digits) in spreads.items():
-        found = [np.mean(values), np.std(values), *np.percentile(values, [0, 5, 50, 95, 100])]
-        marks[name] = dict(zip(header, map(float, found), strict=True))
-        table.append([name, *(f"{x:.{digits}f}" for x in found)])
-    kinds = {g.kind for p in described for g in p.garments}
-    outfits = {tuple(sorted(g.kind for g in p.garments)) for p in described}
-    said = f"{len(kinds)} kinds of garments and accessories, {len(outfits)} different sets of them."
-    text = markdown_table([f"of {people:,} people", *header], table, "l" * 8)
-    run.show(f"{text}\n\n{said}", {"spreads": marks, "kinds": len(kinds), "sets": len(outfits)})
-
-
 def count_faults(body, posed, camera):
     """(6,) pixels of the person, then those of FAULTS."""
     subject = posed.subject
@@ -128,7 +98,7 @@ def _faces_the_eye(vertices, faces, eye):
 
 # Contact sheets ------------------------------------------------------------------------------------------------------
 
-FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
+FRONT_BACK_SIZE, MOTION_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
 """Width and height of one image, pixels."""
 COLUMNS = 16
 MOTION_FRAMES = 75
@@ -139,9 +109,9 @@ TELE = 0.42
 
 @entry
 def people_sheets(run: Run, out: Path = Path("docs/images"), subjects: int = 64) -> None:
-    """Contact sheets of synthetic people: front and back, 16 of them all around, 8 heads and hands, 8 sequences of 8 frames.
+    """Contact sheets of synthetic people: front and back, 8 heads and hands, 8 sequences of 8 frames.
 
-    All four take 90 s of one CPU core. The same command gives the same images bit for bit on the same machine.
+    All three take a minute of one CPU core. The same command gives the same images bit for bit on the same machine.
 
     Options:
     out: folder to write into
@@ -149,9 +119,13 @@ def people_sheets(run: Run, out: Path = Path("docs/images"), subjects: int = 64)
     """
     body = load_body()
     out.mkdir(parents=True, exist_ok=True)
-    makers = {"front_back": front_back, "views": all_around, "close": close_ups, "sequences": motions}
-    for i, ((name, maker), count) in enumerate(zip(makers.items(), (subjects, 16, 8, 8), strict=True)):
-        sheet, file = maker(body, DEMO[100 * i : 100 * i + count]), out / f"people_{name}.jpg"
+    makers = {
+        "front_back": (front_back, DEMO[:subjects]),
+        "close": (close_ups, DEMO[200:208]),
+        "sequences": (motions, DEMO[300:308]),
+    }
+    for name, (maker, seeds) in makers.items():
+        sheet, file = maker(body, seeds), out / f"people_{name}.jpg"
         pixels = np.round(np.clip(sheet, 0, 1) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(file, quality=QUALITY)
         print(f"{file}: {sheet.shape[1]} x {sheet.shape[0]}, {file.stat().st_size / 1e3:.0f} kB")
@@ -166,16 +140,6 @@ def front_back(body, seeds):
         cells.append([_whole(posed, turn + a, FRONT_BACK_SIZE) for a in (0.25, np.pi + 0.25)])
     chunks = [cells[start : start + COLUMNS] for start in range(0, len(cells), COLUMNS)]
     return _grid([[pair[side] for pair in chosen] for chosen in chunks for side in (0, 1)])
-
-
-def all_around(body, seeds):
-    """One row a person, eight views around; two people side by side."""
-    rows = []
-    for seed in seeds:
-        posed = sample_pose(make_subject(seed, body), 0)
-        azimuths = posed.rotations[0, 1] + np.arange(8) * (np.pi / 4)
-        rows.append([_whole(posed, a, VIEW_SIZE) for a in azimuths])
-    return _in_pairs(rows)
 
 
 def close_ups(body, seeds):
@@ -206,8 +170,9 @@ def motions(body, seeds):
         pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][anatomy.PELVIS]
         facing = _azimuth(pelvis @ [0, 0, 1])
         posed = [pose_subject(subject, rotations[i], translations[i]) for i in np.linspace(0, len(rotations) - 1, 8).astype(int)]
-        rows.append([_whole(p, facing + 0.7, VIEW_SIZE) for p in posed])
-    return _in_pairs(rows)
+        rows.append([_whole(p, facing + 0.7, MOTION_SIZE) for p in posed])
+    half = len(rows) // 2
+    return _grid([a + b for a, b in zip(rows[:half], rows[half:], strict=True)])
 
 
 def _azimuth(direction):
@@ -231,11 +196,6 @@ def _whole(posed, azimuth, size):
 def _near(posed, target, reach, azimuth, elevation):
     """A close-up of `reach` metres around a point, from a metre away."""
     return _seen(posed, target, 1.2, azimuth, elevation, 2 * np.arctan(reach / 1.2), CLOSE_SIZE)
-
-
-def _in_pairs(rows):
-    half = (len(rows) + 1) // 2
-    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
 
 
 def _grid(rows):

@@ -2,11 +2,13 @@
 
 import math
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from experiments.chromium import Chromium, missing
 from experiments.harness import Run, entry
@@ -19,6 +21,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.io.images import to_uint8
 from humangs_jax.losses.losses import masked_psnr, psnr
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import render
@@ -31,6 +34,8 @@ VERTICAL_FOV = math.pi / 6
 FINE_EDGE = 0.017
 """Metres; the longest edge of a body that carries some 60,000 Gaussians."""
 MOTION_WINDOW = (480, 600)
+PICTURE_WINDOW, WAIT = (1280, 800), 4.0
+"""Of the picture: CSS pixels, and seconds of the walk before it is taken."""
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
     ("foreground PSNR, dB", "person"),
@@ -145,3 +150,20 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
     pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
     camera = Camera.from_opencv(np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"])
     return compare(image, avatar, camera, pose)
+
+
+@entry
+def viewer_picture(run: Run, avatar: Path, out: Path = Path("docs/images/viewer.png")) -> None:
+    """A picture of the page that shows an avatar, a moment after it was opened. Needs Debian's chromium and chromium-driver.
+
+    Options:
+    avatar: file written by humangs reconstruct
+    out: PNG to write
+    """
+    if reason := missing():
+        raise ValueError(reason)
+    with tempfile.TemporaryDirectory() as folder, Chromium(*PICTURE_WINDOW) as browser:
+        write_page(Path(folder) / "avatar.html", Avatar.load(avatar))
+        browser.open(Path(folder) / "avatar.html")
+        time.sleep(WAIT)
+        Image.fromarray(to_uint8(browser.screenshot())).save(out, optimize=True)

@@ -19,9 +19,6 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
-from humangs_jax.people.subject import make_subject
-from humangs_jax.people.surroundings import cameras_around, spread_azimuths
-from humangs_jax.people.writer import View, capture_views, sample_pose
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
 from humangs_jax.refinement.refine import refine
@@ -128,71 +125,6 @@ def plot_views(path: Path, mean: dict[int, Any]) -> None:
                     label = f"{name}: {TASKS[task]}"
                     axis.plot(list(mean)[: len(values)], values, style, ms=4, color=f"C{color}", label=label)
             axis.set(xlabel="photos", ylabel="PSNR, dB", title=title, xticks=list(mean))
-
-
-# Light ---------------------------------------------------------------------------------------------------------------
-
-LIGHT_POSES, LIGHT_HELD_OUT = 6, 3
-"""Poses of a person, held-out views of each. The first four poses are those of photos, two are unseen."""
-
-
-@entry
-def light(run: Run, people: People = People(16)) -> None:
-    """What the light of the photos gains: avatars with it and without, and the limit of those without.
-
-    "One pose": four photos of one pose. "Four poses": one photo of each of four poses. Avatars are those of the pass and of the
-    iterations of refinement. "True surface": the generator's own people in a new pose, with the light that each point has in the
-    photos of one pose: the best that an avatar with fixed colors can do.
-    """
-    start, refiner = people.start(), {"refiner": shipped_digest(SHIPPED_REFINER)}
-    mean = means(start.rows(run, functools.partial(_light_of, start), refiner))
-    keys = ("psnr", "psnr_fg", *(["lpips"] if start.lpips else []))
-    rows = []
-    for name, tasks in mean.items():
-        photos, avatar, lit = name.split(", ") if ", " in name else ("", "true surface, fixed colors", "")
-        of_photos = cells(tasks["novel"], keys) if photos else [""] * len(keys)
-        rows.append([photos, avatar, lit, *of_photos, *cells(tasks["animation"], keys)])
-    headings = [COLUMNS[key][0] for key in keys[1:]]
-    scores = ["poses of the photos: PSNR", *headings, "novel poses: PSNR", *headings]
-    table = markdown_table(["photos of", "avatar", "light", *scores], rows, "lll" + "r" * len(scores))
-    about = f"Means over {len(start.seeds)} people of the {people.split} seeds, four photos of {people.size} px; dB" + (
-        f"; LPIPS {people.lpips_net}." if start.lpips else "."
-    )
-    run.show(f"{about}\n\n{table}", {"settings": start.settings | refiner, "means": mean})
-
-
-def _light_of(start, seed):
-    subject, rng = make_subject(seed, start.body), np.random.default_rng([seed, RING])
-    posed = [sample_pose(subject, i) for i in range(LIGHT_POSES)]
-    rings = [cameras_around(rng, pose.vertices, spread_azimuths(rng, RING), start.size) for pose in posed]
-    held = [cameras_around(rng, pose.vertices, spread_azimuths(rng, LIGHT_HELD_OUT), start.size) for pose in posed]
-    of_photos = {
-        "one pose": [View(0, f"photo_{i}", rings[0][RING // PHOTOS * i]) for i in range(PHOTOS)],
-        "four poses": [View(i, f"photo_{i}", rings[i][RING // PHOTOS * i]) for i in range(PHOTOS)],
-    }
-    views = [View(i, f"{i}_{k}", held[i][k]) for i in range(LIGHT_POSES) for k in range(LIGHT_HELD_OUT)]
-    truth, found = capture_views(subject, start.body, posed, views), {}
-    frames = np.asarray(truth.frames)
-
-    def scores(drawn, seen):
-        by_task = {}
-        for task, chosen in (("novel", seen), ("animation", [LIGHT_POSES - 2, LIGHT_POSES - 1])):
-            at = np.flatnonzero(np.isin(frames, chosen))
-            alone = dataclasses.replace(truth.select(at), frames=np.zeros(len(at), int))
-            by_task[task] = score_tasks(drawn[at], alone, start.lpips)["novel"]
-        return by_task
-
-    for name, photographed in of_photos.items():
-        photos = capture_views(subject, start.body, posed, photographed)
-        for lit, how in (("without", start.config.with_conventions(light=False)), ("with", start.config)):
-            avatar = reconstruct(start.variables, how, photos)
-            for label, made in zip(AVATARS, (avatar, refine(avatar, photos, ITERATIONS_ALONE)), strict=True):
-                drawn = draw_views(made, truth).images
-                found[f"{name}, {label}, {lit}"] = scores(drawn, sorted({view.frame for view in photographed}))
-    light_of_first = {key: getattr(posed[0], key) for key in ("normals", "openness", "lit")}
-    fixed = [dataclasses.replace(pose, **light_of_first) for pose in posed]
-    found["true surface"] = scores(capture_views(subject, start.body, fixed, views).images, [0])
-    return found
 
 
 # Masks ---------------------------------------------------------------------------------------------------------------

@@ -82,30 +82,6 @@ def written_subject(folder: Path, config: Any, body: Any) -> Path:
     return path
 
 
-class ChangedSource:
-    """A `Source` with other examples.
-
-    change: (example, seed, number) -> example. index: number of an example -> number of the one in its place.
-    """
-
-    def __init__(self, source: Any, change: Any = lambda example, *_: example, index: Any = lambda i: i):
-        self._source, self._change, self._index = source, change, index
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_source":  # of a copy that is being made
-            raise AttributeError(name)
-        return getattr(self._source, name)
-
-    def __len__(self) -> int:
-        return len(self._source)
-
-    def example(self, seed: int, index: int, input_count: int) -> Example:
-        return self._change(self._source.example(seed, self._index(index), input_count), seed, index)
-
-    def describe(self, seed: int, index: int, input_count: int) -> str:
-        return self._source.describe(seed, self._index(index), input_count)
-
-
 CASES = {
     "small 256": ("small", 256, 4, 2),
     "published 256": ("published", 256, 4, 4),

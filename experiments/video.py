@@ -1,18 +1,14 @@
-"""What the options of `humangs animate` and `humangs render` give: a sheet of images, what presets and pruning cost and save."""
+"""What the options of `humangs animate` and `humangs render` give, as a sheet of images."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
 from experiments.harness import Run, entry
-from experiments.results import markdown_table
 from experiments.subjects import shipped_person
-from experiments.timing import medians
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import (
     a_pose_of,
@@ -22,7 +18,6 @@ from humangs_jax.avatar.frames import (
     rest_pose_of,
     splatting_of,
     turntable_views,
-    without_unseen,
 )
 from humangs_jax.avatar.layers import LAYERS, exr_view
 from humangs_jax.avatar.shot import Shot
@@ -37,42 +32,23 @@ SHOWN = 6
 """Images in a row of the sheet."""
 FIRST = 10
 """The frame of the walk that stands for the others."""
-TIMED = 12
-"""Frames that are timed, evenly spaced."""
 
 
 @entry
-def video(run: Run, avatar: Path | None = None, image: Path | None = None, size: int = 512, repeats: int = 5) -> None:
-    """What the options of `humangs animate` and `humangs render` give, and what presets and pruning cost and save.
+def video(run: Run, image: Path, avatar: Path | None = None) -> None:
+    """A sheet of what the options of `humangs animate` and `humangs render` give: the shipped walk, moved 2.5 metres forward.
 
-    The walk is the shipped one, moved 2.5 metres forward. Times are CPU times of drawing the same frames of the walk, medians of
-    iterations in which each way of drawing has its turn, as shares of that of the exact preset; PSNR is the lowest of the frames.
+    A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers.
 
     Options:
+    image: JPEG to write
     avatar: an avatar file instead of the shipped person, feed-forward
-    image: write a sheet of images here
-    size: side of the images that are timed, pixels
-    repeats: iterations of timing; 0: none
     """
     person, motion = Avatar.load(avatar) if avatar else shipped_person(), forward_walk()
-    if image:
-        write_sheet(image, person, motion)
-    if not repeats:
-        return
-    numbers = measure(person, motion, size, repeats)
-    rows = []
-    for name, row in numbers.items():
-        if isinstance(row, dict):
-            shown = name != "exact" and "psnr" in row
-            quality = [f"{row['psnr']:.1f}", f"{255 * row['largest_error']:.1f}"] if shown else ["", ""]
-            rows.append([name, f"{row['cpu_ms'] / numbers['exact']['cpu_ms']:.2f}", *quality])
-    every = numbers["gaussians"]
-    said = (
-        f"{numbers['frames']} frames of {size} pixels. In these frames {numbers['seen'] / every:.1%} of {every:,} Gaussians are "
-        f"seen, in a walk with a whole turn of the camera {numbers['seen_in_a_turn'] / every:.1%}."
-    )
-    table = markdown_table(("", "time", "least PSNR, dB", "largest error, of 255"), rows)
-    run.show(f"{table}\n\n{said}", numbers)
+    rows = [*(walked(person, motion, follow) for follow in (True, False)), looked_at(person, motion)]
+    rows += [posed_before(person), layered(person, motion)]
+    sheet = [tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows]
+    Image.fromarray(to_uint8(np.concatenate(sheet))).save(image, quality=88)
 
 
 def forward_walk() -> Motion:
@@ -80,19 +56,6 @@ def forward_walk() -> Motion:
     motion = load_motion()
     path = np.asarray(motion.translations) + np.linspace([0, 0, 0], [0, 0, WALKED], len(motion.translations))
     return replace(motion, translations=jnp.asarray(path, jnp.float32))
-
-
-def write_sheet(path: Path, avatar: Avatar, motion: Motion) -> None:
-    """A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers."""
-    rows: list[list[tuple[str, np.ndarray]]] = [
-        walked(avatar, motion, follow=True),
-        walked(avatar, motion, follow=False),
-        looked_at(avatar, motion),
-        posed_before(avatar),
-        layered(avatar, motion),
-    ]
-    sheet = [tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows]
-    Image.fromarray(to_uint8(np.concatenate(sheet))).save(path, quality=88)
 
 
 def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.ndarray]]:
@@ -106,23 +69,19 @@ def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.n
 
 
 def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
-    shots = {
-        "--azimuth 180": Shot(size=240, azimuth=180.0),
-        "--elevation 60": Shot(size=240, azimuth=20.0, elevation=60.0),
-        "--elevation -30": Shot(size=240, azimuth=20.0, elevation=-30.0),
-        "--fov 90": Shot(size=240, azimuth=20.0, fov=90.0),
-        "--distance 1.5": Shot(size=240, azimuth=20.0, distance=1.5),
-        "--splat fast": Shot(size=240, azimuth=20.0, splat="fast"),
-    }
+    """The walk from other sides, and drawn otherwise."""
     drawn = []
-    for label, shot in shots.items():
+    changes = [("azimuth", 180), ("elevation", 60), ("elevation", -30), ("fov", 90), ("distance", 1.5), ("splat", "fast")]
+    for name, value in changes:
+        shot = dataclasses.replace(Shot(size=240, azimuth=20.0), **{name: value})
         poses, cameras = motion_views(avatar, motion, shot)
         one = slice(FIRST, FIRST + 1)
-        drawn.append((label, next(images(avatar, poses[one], cameras[one], shot))))
+        drawn.append((f"--{name} {value}", next(images(avatar, poses[one], cameras[one], shot))))
     return drawn
 
 
 def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
+    """Poses before backgrounds."""
     drawn = []
     for name, pose in (("T-pose", rest_pose_of(avatar)), ("--pose a", a_pose_of(avatar))):
         for color in ("white", "#24425c", "transparent"):
@@ -132,7 +91,7 @@ def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
     return drawn
 
 
-def over_checks(image: "np.ndarray") -> "np.ndarray":
+def over_checks(image: np.ndarray) -> np.ndarray:
     """A transparent image over grey squares; another one as it is."""
     if image.shape[-1] == 3:
         return image
@@ -164,44 +123,3 @@ def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
         ("normal", np.where(seen, 0.5 + 0.5 * normal, 0)),
         ("part", palette[view.channels["part"].astype(int)]),
     ]
-
-
-def measure(avatar: Avatar, motion: Motion, size: int, repeats: int) -> dict[str, Any]:
-    """PSNR and CPU time of presets, of the search for what is seen, and of drawing without the rest."""
-    shot = Shot(size=size, azimuth=20.0)
-    poses, cameras = motion_views(avatar, motion, shot)
-    chosen = np.linspace(0, len(poses) - 1, TIMED).astype(int)
-    poses, cameras = poses[chosen], cameras[chosen]
-    exact = splatting_of(shot, avatar)
-    seen = without_unseen(avatar, poses, cameras, exact)
-    turned_poses, turned_cameras = motion_views(avatar, motion, shot, turn=360.0)
-    turned = without_unseen(avatar, turned_poses[chosen], turned_cameras[chosen], exact)
-
-    def drawing(person: Avatar, how: Any) -> Callable[[], list[np.ndarray]]:
-        return lambda: [np.asarray(rendering.rgb) for rendering in draw(person, poses, cameras, None, how)]
-
-    runs: dict[str, Callable[[], Any]] = {
-        preset: drawing(avatar, splatting_of(dataclasses.replace(shot, splat=preset), avatar)) for preset in PRESETS
-    }
-    runs["--prune: finding what is seen"] = lambda: without_unseen(avatar, poses, cameras, exact)
-    runs["--prune: drawing it"] = drawing(seen, exact)
-    truth = runs["exact"]()
-    numbers: dict[str, Any] = {
-        "gaussians": len(avatar.gaussians.means),
-        "seen": len(seen.gaussians.means),
-        "seen_in_a_turn": len(turned.gaussians.means),
-        "size": size,
-        "frames": TIMED,
-    }
-    milliseconds = medians(runs, repeats)
-    for name, run in runs.items():
-        row: dict[str, Any] = {"cpu_ms": float(milliseconds[name][1]) / TIMED}
-        if name != "--prune: finding what is seen":
-            errors = [np.abs(a - b) for a, b in zip(truth, run(), strict=True)]
-            row["psnr"] = min(float(-10 * np.log10(max(np.mean(e**2), 1e-20))) for e in errors)
-            row["largest_error"] = max(float(e.max()) for e in errors)
-        numbers[name] = row
-    return numbers
-
-
-PRESETS = ("exact", "near_exact", "fast")

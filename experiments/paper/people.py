@@ -9,13 +9,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.training import ChangedSource
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import save_capture
-from humangs_jax.data.loading import Example, PeopleCache
+from humangs_jax.data.loading import CaptureSource, Example, PeopleCache
 from humangs_jax.data.loading.captures import CaptureFolder, find_captures
 from humangs_jax.data.loading.examples import StoredSubject
 from humangs_jax.geometry.camera import Camera
@@ -26,7 +25,7 @@ from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import Person, PosedSubject, describe, make_subject, seeds_of
 from humangs_jax.people.surroundings import cameras_around, sample_lights, spread_azimuths
 from humangs_jax.people.writer import HELD_OUT, View, capture_views, stand
-from humangs_jax.training.sources import MakeSource, cached_people
+from humangs_jax.training.sources import MakeSource
 
 SIZE, POSES = 32, 8
 """Pixels a side; poses that all people share."""
@@ -107,15 +106,18 @@ class OnePose(CaptureFolder):
         return found._replace(**{name: getattr(found, name)[first] for name in ("K", "cam_from_world", "frames", "azimuths")})
 
 
-def recolored_example(example: Example, seed: int, index: int) -> Example:
-    """Its color channels exchanged, the same way in all images: six times the dyes."""
-    order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
-    change = lambda views: replace(views, images=views.images[..., order])
-    return replace(example, inputs=change(example.inputs), targets=change(example.targets))
+class Recolored(CaptureSource):
+    """Examples have their color channels exchanged, the same way in all images: six times the dyes."""
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        example = super().example(seed, index, input_count)
+        order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
+        change = lambda views: replace(views, images=views.images[..., order])
+        return replace(example, inputs=change(example.inputs), targets=change(example.targets))
 
 
 def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> MakeSource:
     """The people of a folder as a run's source. one_pose: of the first pose alone."""
-    body, kind = load_body(), OnePose if one_pose else CaptureFolder
-    make = cached_people(PeopleCache([kind(path, body) for path in find_captures(folder)]))
-    return (lambda config: ChangedSource(make(config), recolored_example)) if recolored else make
+    body, kind, source = load_body(), OnePose if one_pose else CaptureFolder, Recolored if recolored else CaptureSource
+    cache = PeopleCache([kind(path, body) for path in find_captures(folder)])
+    return lambda config: source(cache, config.views, config.model.image_size, config.target_size, config.loss.depth > 0)

@@ -10,29 +10,23 @@ from experiments.harness import call, listed
 PEOPLE = "--subjects 1 --held-out 1 --poses 1 --pose-views 1 --size 64"
 CASES = {
     "extremes": "--cases black",
-    "fit_end_to_end": "--people 1 --seconds 0.5",
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
     "fit_refinement": "--subjects 1 --views 2 --size 64 --images FOLDER --cases bare",
     "fit_scans": "--subjects 1 --kinds bare",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
-    "light": PEOPLE,
-    "loss_gradients": "--quick",
     "masks": PEOPLE,
     "paper_claims": "",
-    "people_diversity": "--people 20",
     "people_faults": "--subjects 1 --size 64",
-    "video": "--size 64 --repeats 1 --image FOLDER/a.jpg",
     "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",
     "splatting_finite_differences": "--size 32",
     "splatting": "--sizes 64 --repeats 1",
     "splatting_tradeoff": "--size 64 --repeats 1 --image FOLDER/a.png --only preset scale",
     "stability": "--types float32 --seeds 1",
     "training_cost": "--preset tiny --chips 1 --sizes 32 --variants kept",
-    "training_extremes": "--steps 6 --only",
     "training_steps": "--repeats 1 --only",
 }
 """Options of each; the last words are given whole."""
-LAST = {"fit_sequences": ["all frames seen"], "training_extremes": ["as it is", "float16 compute"], "training_steps": ["tiny 32"]}
+LAST = {"fit_sequences": ["all frames seen"], "training_steps": ["tiny 32"]}
 
 
 @pytest.fixture(autouse=True)

@@ -1,16 +1,132 @@
-"""The gradient of every loss term against differences, in float64."""
+"""The gradient of every loss term against differences, in float64: relative error of derivatives in random directions."""
+
+import dataclasses
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from experiments.training_checks import NETWORKS, agreement, network_case, own_case, term_names
+from experiments.training import random_networks, settings, written_subject
+from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.loading import CaptureCache, CaptureSource
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.losses.losses import FAR_SURFACE, loss_terms, ray_spread
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.parts import Drawn
+from humangs_jax.rendering.splatting import Rendering
+from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.forward import draw_targets, reconstruct_example, white_backgrounds
+from humangs_jax.training.step import subject_loss
 
 OWN = 1e-7
 """Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners have some within a step."""
 WHOLE = 1e-4
 """Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha) within a step, and some
 Gaussians exchange places in the depth order."""
-PLAIN = [name for name in term_names() if name not in NETWORKS]
+NETWORKS = ("perceptual", "vgg16", "lpips")
+"""Terms that need a network of their own."""
+SIDE, TARGETS, VERTICES = 32, 2, 800
+STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
+"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
+exchange places in the depth order, and colors jump."""
+TERMS = [each.name for each in dataclasses.fields(LossConfig) if each.name not in ("structural_scales", "random_background")]
+PLAIN = [name for name in TERMS if name not in NETWORKS]
+
+
+def loss_of(names):
+    """A `LossConfig` with these terms and no others, for small images."""
+    weights = dict.fromkeys(TERMS, 0.0) | dict.fromkeys(names, 1.0)
+    return LossConfig(**weights, structural_scales=1, random_background=0.0)
+
+
+def agreement(values, point, names, directions=3, steps=STEP_SIZES):
+    """{term: relative error of its derivatives}. values: point -> {term: number}; differentiable. point: a tree of float64."""
+    vector = jax.jit(lambda point: jnp.stack([values(point)[name] for name in names]))
+    gradient = jax.jit(jax.grad(lambda point, weights: jnp.dot(weights, vector(point))))
+    rng = np.random.default_rng(0)
+    size = lambda x: np.sqrt(np.mean(np.square(x)))
+    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point) for _ in range(directions)]
+    inner = lambda a, b: sum(np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    gradients = [jax.device_get(gradient(point, weights)) for weights in np.eye(len(names))]
+    derivatives = np.asarray([[inner(g, way) for way in ways] for g in gradients])
+    best = np.full((len(names), directions), np.inf)
+    along = lambda way, step: vector(jax.tree.map(lambda x, d: x + step * d, point, way))
+    for step in steps:
+        found = [np.asarray(along(way, step) - along(way, -step)) / (2 * step) for way in ways]
+        best = np.fmin(best, np.abs(np.stack(found, axis=1) - derivatives))
+    errors = np.linalg.norm(best, axis=1) / np.linalg.norm(derivatives, axis=1)
+    return dict(zip(names, errors.tolist(), strict=True))
+
+
+def own_case(names, side=SIDE):
+    """(values, point) of the terms alone, on made-up renderings."""
+    rng = np.random.default_rng(1)
+    pixels, vertices = (TARGETS, side, side), 5
+    uniform = lambda *shape: rng.uniform(0.1, 0.9, shape)
+    depth = 2 + uniform(*pixels)
+    point = {
+        "rgb": uniform(*pixels, 3),
+        "alpha": uniform(*pixels),
+        "depth": depth,
+        "spread": 0.1 * uniform(*pixels),
+        "opacities": uniform(3 * vertices),
+        "tight_offsets": rng.normal(size=(vertices, 1, 3)),
+    }
+    images, masks = jnp.asarray(uniform(*pixels, 3)), jnp.asarray(uniform(*pixels))
+    depths = jnp.asarray(depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, pixels))
+    config = loss_of(names)
+    networks = random_networks(TrainConfig(loss=config))
+
+    def values(point):
+        point = {name: jnp.asarray(x) for name, x in point.items()}
+        alpha, mean = point["alpha"], point["depth"]
+        one = lambda rgb, alpha, depth: Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32))
+        rendering = jax.vmap(one)(point["rgb"], alpha, mean)
+        spread = ray_spread(alpha, mean, mean**2 + point["spread"])
+        drawn = Drawn(rendering, spread, point["opacities"], point["tight_offsets"])
+        return loss_terms(drawn, images, masks, depths, config, networks)
+
+    return values, point
+
+
+def network_case(names, folder):
+    """(values, point) of the smallest network's training step. The point is its parameters."""
+    config = settings("tiny", SIDE, 2, TARGETS)
+    model = config.model.with_conventions(body_vertices=VERTICES).with_runtime(token_capacity=0)
+    config = dataclasses.replace(config, model=model, loss=loss_of(names))
+    networks, key, body = random_networks(config), jax.random.key(0), load_body()
+    person = written_subject(folder, config, body)
+    example = CaptureSource(CaptureCache([person], body), config.views, SIDE, SIDE).example(0, 0, 2)
+    rng = np.random.default_rng(2)
+
+    def wide(tree):
+        cast = lambda x: x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x
+        return jax.tree.map(lambda x: jnp.asarray(cast(np.asarray(x))), tree)
+
+    variables = wide(init_humangs(key, model))
+    body, example = wide(gaussian_body(body, model)), wide(example)
+    batch_stats = variables["batch_stats"]
+    # a fresh network has zeros, to which nothing upstream of them has a derivative
+    point = jax.tree.map(lambda x: x + 0.05 * rng.normal(size=x.shape), variables["params"])
+
+    @jax.jit
+    def depths(point):
+        variables, targets = {"params": point, "batch_stats": batch_stats}, example.targets
+        outputs, _ = reconstruct_example(variables, body, example.inputs, config, True)
+        given = body, example.inputs, targets, white_backgrounds(targets), config
+        return draw_targets(variables, outputs, *given).rendering.depth
+
+    depth = depths(point)
+    surface = depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, depth.shape)
+    example = replace(example, targets=replace(example.targets, depths=surface))
+
+    def values(point):
+        _, (_, terms) = subject_loss(point, batch_stats, body, example, key, config, networks)
+        return terms
+
+    return values, point
 
 
 @pytest.mark.slow
@@ -28,8 +144,8 @@ def test_terms_with_networks_of_their_own():
 
 
 @pytest.mark.slow
-def test_terms_of_the_whole_network():
-    """Those with networks of their own are in the script: minutes of convolutions in float64."""
+def test_terms_of_the_whole_network(tmp_path):
+    """Without those with networks of their own: minutes of convolutions in float64."""
     with jax.enable_x64(True):
-        errors = agreement(*network_case(PLAIN), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9))
+        errors = agreement(*network_case(PLAIN, tmp_path), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9))
     assert set(errors) == set(PLAIN) and all(error < WHOLE for error in errors.values()), errors
