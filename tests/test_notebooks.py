@@ -22,7 +22,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-TIMEOUT_SECONDS = 600
+TIMEOUT_SECONDS = 1800
 MOST_BYTES = 1_500_000
 """Of a notebook: no page of the viewer is in it."""
 

@@ -212,7 +212,7 @@ def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
     for file, number in zip(files, numbers, strict=True):
         content = _content(file)[0]
         if not isinstance(content, dict | list):
-            raise Refused(f"{file.name}: expected a JSON object, got {type(content).__name__}")
+            raise MotionError(file, "", f"expected a JSON object, got {type(content).__name__}")
         people = _found(content, "", 0)
         if apart:
             people = [person._replace(name=number[-1]) for person in people]
