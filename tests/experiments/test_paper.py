@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from command_line import run as run_command
+from data.datasets import made_up
 from safetensors.numpy import save_file
 
-from experiments import made_up
 from experiments.harness import call
 from experiments.paper import bench, claims, cost, people, rows, tables, train_all
 from experiments.training import abstract_batch, random_networks

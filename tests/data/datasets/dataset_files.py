@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import pickle
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -104,45 +106,71 @@ def write_obj(path, vertices, faces, uvs=None):
     path.write_text("\n".join(lines) + "\n")
 
 
+def write_fit(folder, values, mesh, faces):
+    """smplx_param.pkl and mesh_smplx.obj."""
+    folder.mkdir(parents=True)
+    (folder / "smplx_param.pkl").write_bytes(pickle.dumps(values))
+    write_obj(folder / "mesh_smplx.obj", mesh, faces)
+
+
+def write_scan(folder, vertices, faces, uvs, texture):
+    """NAME.obj, material0.mtl and material0.jpeg."""
+    folder.mkdir(parents=True)
+    write_obj(folder / f"{folder.name}.obj", vertices, faces, uvs)
+    (folder / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
+    Image.fromarray(texture).save(folder / "material0.jpeg", quality=95)
+
+
 def write_thuman(folder, arrays, kinds="ABC"):
     """A scan for each kind of fit: a cube around the body."""
     for i, kind in enumerate(kinds):
         values, name = fit_values(kind, i), f"{i:04d}"
         _, mesh, _ = scan_vertices(arrays, values)
-        fit, model = folder / "smplx" / name, folder / "model" / name
-        fit.mkdir(parents=True)
-        model.mkdir(parents=True)
-        (fit / "smplx_param.pkl").write_bytes(pickle.dumps(values))
-        write_obj(fit / "mesh_smplx.obj", mesh, arrays["f"])
+        write_fit(folder / "smplx" / name, values, mesh, arrays["f"])
         low, high = mesh.min(0), mesh.max(0)
         corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
         faces = np.asarray([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
         faces = np.concatenate([faces, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
-        write_obj(model / f"{name}.obj", low + corners * (high - low), faces, corners[:, :2].astype(float))
-        (model / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
-        Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(model / "material0.jpeg")
+        places, texture = low + corners * (high - low), np.full((8, 8, 3), 90, np.uint8)
+        write_scan(folder / "model" / name, places, faces, corners[:, :2].astype(float), texture)
     return folder
 
 
 # Videos ---------------------------------------------------------------------------------------------------------------
 
 
-def cameras():
-    """R, T of cameras that look at the origin from 3 m, K."""
-    poses = []
+class Recording(NamedTuple):
+    """A person seen by c cameras. K (3, 3) of all, pixel centres at whole numbers; R (c, 3, 3), T (c, 3) of OpenCV; shot(c, f):
+    photo and mask, 8 bits; parameters: by the names of smpl_params.npz, a row a frame.
+    """
+
+    K: np.ndarray
+    R: np.ndarray
+    T: np.ndarray
+    size: tuple[int, int]
+    frames: int
+    shot: Callable
+    parameters: dict
+
+
+def recording(frames=FRAMES):
+    """Grey photos of cameras that look at the origin from 3 m."""
+    turns = []
     for azimuth in np.arange(CAMERAS) * 2 * np.pi / CAMERAS:
         s, c = np.sin(azimuth), np.cos(azimuth)
-        poses.append((np.asarray([[c, 0, -s], [0, -1, 0], [-s, 0, -c]]), np.asarray([0, 0, 3.0])))
-    return poses, np.asarray([[20.0, 0, 5.5], [0, 20, 7.5], [0, 0, 1]])
-
-
-def write_photo(photo, mask):
-    for path in (photo, mask):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.full((HEIGHT, WIDTH, 3), 100, np.uint8)).save(photo, quality=95)
-    person = np.zeros((HEIGHT, WIDTH), np.uint8)
+        turns.append([[c, 0, -s], [0, -1, 0], [-s, 0, -c]])
+    photo, person = np.full((HEIGHT, WIDTH, 3), 100, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
     person[4:12, 3:9] = 255
-    Image.fromarray(person).save(mask, quality=95)
+    K, T = np.asarray([[20.0, 0, 5.5], [0, 20, 7.5], [0, 0, 1]]), np.tile([0, 0, 3.0], (CAMERAS, 1))
+    return Recording(
+        K, np.asarray(turns), T, (WIDTH, HEIGHT), frames, lambda *_: (photo, person), parameter_arrays(frames=frames)
+    )
+
+
+def write_photo(photo, mask, pixels):
+    for path, image in zip((photo, mask), pixels, strict=True):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(path, quality=95)
 
 
 def parameter_arrays(seed=0, frames=FRAMES):
@@ -153,50 +181,52 @@ def parameter_arrays(seed=0, frames=FRAMES):
     return {key: x.astype(np.float32) for key, x in (arrays | {"expression": np.zeros((frames, COLUMNS))}).items()}
 
 
-def calibration(names):
-    poses, K = cameras()
+def calibration(names, made):
     flat = lambda x: np.asarray(x, float).reshape(-1).tolist()
-    size = [WIDTH, HEIGHT]
-    return {n: {"K": flat(K), "R": flat(R), "T": flat(T), "imgSize": size} for n, (R, T) in zip(names, poses, strict=True)}
+    one = lambda R, T: {"K": flat(made.K), "R": flat(R), "T": flat(T), "imgSize": list(made.size)}
+    return {name: one(R, T) for name, R, T in zip(names, made.R, made.T, strict=True)}
 
 
-def write_folders(folder, names, photos, masks, rig, frames):
-    """Videos as photos in folders; `photos` and `masks` name those of a camera."""
-    for name in names:
-        for frame in range(frames):
-            file = f"{frame:08d}.jpg"
-            write_photo(folder / photos.format(name) / file, folder / masks.format(name) / file)
-    (folder / rig).write_text(json.dumps(calibration(names)))
-    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
+def write_folders(folder, made, names, photos, masks, rig, every=1):
+    """A recording as photos in folders; `photos` and `masks` name those of a camera. every: photos show every n-th row."""
+    for c, name in enumerate(names):
+        for frame in range(made.frames):
+            file = f"{every * frame:08d}.jpg"
+            write_photo(folder / photos.format(name) / file, folder / masks.format(name) / file, made.shot(c, frame))
+    (folder / rig).write_text(json.dumps(calibration(names, made)))
+    np.savez(folder / "smpl_params.npz", **{key: np.repeat(x, every, axis=0) for key, x in made.parameters.items()})
     return folder
 
 
+AVATARREX = "{}", "{}/mask/pha", "calibration_full.json"
+THUMAN4 = "images/{}", "masks/{}", "calibration.json"
+
+
 def write_avatarrex(folder, frames=FRAMES):
-    return write_folders(folder, ["22010708", "22010710"], "{}", "{}/mask/pha", "calibration_full.json", frames)
+    return write_folders(folder, recording(frames), ["22010708", "22010710"], *AVATARREX)
 
 
 def write_thuman4(folder, frames=FRAMES):
-    write_folders(folder, ["cam00", "cam01"], "images/{}", "masks/{}", "calibration.json", frames)
+    write_folders(folder, recording(frames), ["cam00", "cam01"], *THUMAN4)
     (folder / "missing_img_files.txt").write_text("images\\cam01\\00000001.jpg\n")
     return folder
 
 
 def write_actorshq(folder, frames=FRAMES):
-    poses, K = cameras()
-    scale = folder / "4x"
-    for number in range(1, CAMERAS + 1):
-        name = f"Cam{number:03d}"
-        for frame in range(frames):
-            photo = scale / "rgbs" / name / f"{name}_rgb{frame:06d}.jpg"
-            write_photo(photo, scale / "masks" / name / f"{name}_mask{frame:06d}.png")
+    made, scale = recording(frames), folder / "4x"
+    scale.mkdir(parents=True)
     with open(scale / "calibration.csv", "w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"])
-        for i, (R, T) in enumerate(poses):
-            inner = K[0, 0] / WIDTH, K[1, 1] / HEIGHT, (K[0, 2] + 0.5) / WIDTH, (K[1, 2] + 0.5) / HEIGHT
-            turn = Rotation.from_matrix(R.T).as_rotvec()
-            table.writerow([f"Cam{i + 1:03d}", WIDTH, HEIGHT, *turn, *(-R.T @ T), *inner])
-    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
+        K = made.K
+        inner = K[0, 0] / WIDTH, K[1, 1] / HEIGHT, (K[0, 2] + 0.5) / WIDTH, (K[1, 2] + 0.5) / HEIGHT
+        for c, (R, T) in enumerate(zip(made.R, made.T, strict=True)):
+            name = f"Cam{c + 1:03d}"
+            table.writerow([name, WIDTH, HEIGHT, *Rotation.from_matrix(R.T).as_rotvec(), *(-R.T @ T), *inner])
+            for frame in range(frames):
+                photo = scale / "rgbs" / name / f"{name}_rgb{frame:06d}.jpg"
+                write_photo(photo, scale / "masks" / name / f"{name}_mask{frame:06d}.png", made.shot(c, frame))
+    np.savez(folder / "smpl_params.npz", **made.parameters)
     return folder
 
 
@@ -210,7 +240,7 @@ def h5py():
 def write_dna(folder, frames=FRAMES):
     import h5py
 
-    poses, K = cameras()
+    made = recording(frames)
     for part in ("main", "annotations"):
         (folder / part).mkdir(parents=True)
 
@@ -219,21 +249,19 @@ def write_dna(folder, frames=FRAMES):
         Image.fromarray(pixels).save(stream, "PNG")
         return np.frombuffer(stream.getvalue(), np.uint8)
 
-    person = np.zeros((HEIGHT, WIDTH), np.uint8)
-    person[4:12, 3:9] = 255
-    values = parameter_arrays(frames=frames)
+    values = made.parameters
     with (
         h5py.File(folder / "main" / "0001_01.smc", "w") as main,
         h5py.File(folder / "annotations" / "0001_01_annots.smc", "w") as notes,
     ):
-        for c, (R, T) in enumerate(poses):
+        for c, (R, T) in enumerate(zip(made.R, made.T, strict=True)):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = R, T
             at = f"Camera_Parameter/{c:02d}"
-            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = K, np.zeros(5), np.linalg.inv(pose)
+            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = made.K, np.zeros(5), np.linalg.inv(pose)
             for frame in range(frames):
-                main[f"Camera_5mp/{c}/color/{frame}"] = encode(np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
-                notes[f"Mask/{c}/mask/{frame}"] = encode(person)
+                photo, person = map(encode, made.shot(c, frame))
+                main[f"Camera_5mp/{c}/color/{frame}"], notes[f"Mask/{c}/mask/{frame}"] = photo, person
         full = [values["global_orient"], values["body_pose"], values["jaw_pose"], np.zeros((frames, 6))]
         full = np.concatenate([*full, values["left_hand_pose"], values["right_hand_pose"]], 1)
         notes["SMPLx/fullpose"], notes["SMPLx/transl"] = full.reshape(frames, 55, 3), values["transl"]
@@ -248,7 +276,7 @@ def write_dna(folder, frames=FRAMES):
 def write_scenes(folder, arrays, scale=1.3, views=3):
     """One scene of two frames in units of its own; returns the list and what the arrays were made from."""
     rng = np.random.default_rng(5)
-    poses, K = cameras()
+    made = recording()
     betas = 0.5 * rng.normal(size=2 * COLUMNS)
     known = []
     frames = []
@@ -262,16 +290,15 @@ def write_scenes(folder, arrays, scale=1.3, views=3):
         np.savez(folder / "smpl" / f"{i}.npz", faces=arrays["f"], **numbers)
         known.append((rotations, translation))
         for view in range(views):
-            R, T = poses[view % CAMERAS]
             pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = R, scale * T
+            pose[:3, :3], pose[:3, 3] = made.R[view % CAMERAS], scale * made.T[view % CAMERAS]
             path = f"images/{i}_{view}.png"
             image = np.full((HEIGHT, HEIGHT, 3), 255, np.uint8)
             image[4:12, 3:9] = 100
             image[6:8, 5:7] = 255  # a white spot on the clothes
             (folder / "images").mkdir(exist_ok=True)
             Image.fromarray(image).save(folder / path)
-            inner = [K[0, 0], K[1, 1], HEIGHT / 2, HEIGHT / 2]
+            inner = [made.K[0, 0], made.K[1, 1], HEIGHT / 2, HEIGHT / 2]
             frames.append({"image_path": path, "w2c": pose.tolist(), "fxfycxcy": inner, "smpl_path": f"smpl/{i}.npz"})
     content = [{"scene_name": "s0", "mesh_transform": np.eye(4).tolist(), "frames": frames}]
     (folder / "train.json").write_text(json.dumps(content))

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from data.datasets import made_up
+from data.datasets.dataset_files import calibration
 
-from experiments import made_up
 from experiments.your_photos import landmarks_in
 from humangs_jax import cli
 from humangs_jax.apps.check import check_capture
@@ -74,7 +75,7 @@ def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
     video = made_up.Video(tmp_path, made_up.SEEDS[0], frames, len(names), size, None)
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in video.cameras])
     video.R, video.T = poses[:, :3, :3], poses[:, :3, 3]  # of the world of the people, y up
-    (tmp_path / "rig.json").write_text(json.dumps(video.calibration(names)))
+    (tmp_path / "rig.json").write_text(json.dumps(calibration(names, video)))
     views = [[render_view(posed, camera, made_up.BACKGROUND) for camera in video.cameras] for posed in video.posed]
     for part, kind in enumerate(("photos", "masks")):
         (tmp_path / kind).mkdir()

@@ -9,10 +9,9 @@ from dataset_files import (
     CAMERAS,
     FRAMES,
     HEIGHT,
-    cameras,
     h5py,
     model_arrays,
-    parameter_arrays,
+    recording,
     write_actorshq,
     write_avatarrex,
     write_dna,
@@ -60,15 +59,14 @@ def test_a_video_is_read_as_it_was_written(layout, tmp_path, body):
     else:
         assert not subject.missing
     assert subject.frames.tolist() == [frame for frame, _ in shown] and subject.frame_count == FRAMES
-    poses, K = cameras()
+    made = recording()
     for view, (_, camera) in enumerate(shown):
-        R, T = poses[camera]
-        np.testing.assert_allclose(subject.cam_from_world[view, :3, :3], R, atol=FLOAT32)
-        np.testing.assert_allclose(subject.cam_from_world[view, :3, 3], T, atol=FLOAT32)
+        np.testing.assert_allclose(subject.cam_from_world[view, :3, :3], made.R[camera], atol=FLOAT32)
+        np.testing.assert_allclose(subject.cam_from_world[view, :3, 3], made.T[camera], atol=FLOAT32)
         # pixel centres at +0.5; padded by 2 columns on each side
-        np.testing.assert_allclose(subject.K[view, :2, 2], K[:2, 2] + 0.5)
-        np.testing.assert_allclose(subject.squared_K([view], SIZE)[0, :2, 2], K[:2, 2] + 0.5 + [2, 0])
-    values = parameter_arrays()
+        np.testing.assert_allclose(subject.K[view, :2, 2], made.K[:2, 2] + 0.5)
+        np.testing.assert_allclose(subject.squared_K([view], SIZE)[0, :2, 2], made.K[:2, 2] + 0.5 + [2, 0])
+    values = made.parameters
     betas, rotations, translations = subject.parameters([2, 0])
     np.testing.assert_allclose(betas[:10], values["betas"][0], atol=FLOAT32)
     np.testing.assert_allclose(translations, values["transl"][[2, 0]], atol=FLOAT32)
@@ -90,7 +88,8 @@ def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body
     folder = write_avatarrex(tmp_path / "a")
     (folder / "22010708" / "00000000.jpg").unlink()
     (folder / "22010710" / "mask" / "pha" / "00000002.jpg").unlink()
-    write_photo(folder / "22010710" / "00000009.jpg", folder / "22010710" / "mask" / "pha" / "00000009.jpg")
+    camera = folder / "22010710"
+    write_photo(camera / "00000009.jpg", camera / "mask" / "pha" / "00000009.jpg", recording().shot(1, 9))
     (folder / "22010710" / "notes.txt").write_text("not a photo")
     (person,) = open_people(folder, body)
     assert person.subject.missing == {"no photo": 1, "no mask": 1, "no pose": 1}
@@ -100,14 +99,14 @@ def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body
 def test_hdf5_is_read_as_it_was_written(tmp_path, body):
     h5py()
     (person,) = open_people(write_dna(tmp_path / "dna"), body, SIZE)
-    subject, values = person.subject, parameter_arrays()
+    subject, made = person.subject, recording()
     assert len(subject) == FRAMES * CAMERAS and not subject.missing
-    np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], cameras()[0][1][1], atol=FLOAT32)
-    np.testing.assert_allclose(subject.K[0, :2, 2], cameras()[1][:2, 2] + 0.5)
+    np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], made.T[1], atol=FLOAT32)
+    np.testing.assert_allclose(subject.K[0, :2, 2], made.K[:2, 2] + 0.5)
     _, rotations, translations = subject.parameters([1])
-    hands = values["right_hand_pose"][1] + model_arrays()["hands_meanr"]  # flat_hand_mean is False
+    hands = made.parameters["right_hand_pose"][1] + model_arrays()["hands_meanr"]  # flat_hand_mean is False
     np.testing.assert_allclose(rotations[0, 40:].reshape(-1), hands, atol=FLOAT32)
-    np.testing.assert_allclose(translations[0], values["transl"][1], atol=FLOAT32)
+    np.testing.assert_allclose(translations[0], made.parameters["transl"][1], atol=FLOAT32)
     image, mask = subject.photo(3, SIZE)
     assert (image[mask > 0] == 100).all() and (image[mask == 0] == 255).all() and mask[8, 8] == 255
 
