@@ -178,7 +178,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     explained = {swap.views[0] for swap in hands}
     others = find_swaps(observations, kind, views, capture.names)
     others = (swap for swap in others if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead)))
-    swaps = (*hands, *others)
+    swaps = (*others, *hands)
     report = FitReport(
         fitted="keypoints",
         errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},

@@ -241,7 +241,7 @@ def _with_mirrored(seen: PersonViews) -> "_Trial":
     found = _least(seen, found)
     if found.error > DOUBTFUL:
         found = min(found, _least(seen, _try(seen, np.ones(views, bool))), key=lambda each: each.cost)
-    return found if _handedness(found.rig.landmarks, seen.names) >= 0 else _try(seen, ~found.mirrored)
+    return _try(seen, ~found.mirrored) if _handedness(found.rig.landmarks, seen.names) < 0 else found
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

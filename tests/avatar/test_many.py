@@ -54,6 +54,9 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(monke
     errors = {each.name: str(each.error) for each in found if each.avatar is None}
     assert errors == {"13": "thirteen", "7": "seven"}
     assert calls == [(1, 2), (3, 7, 4), 3, 7, 4, 5]
+    monkeypatch.setattr(many, "reconstruct", lambda *_: load(13))  # what no capture is to blame for ends it
+    with pytest.raises(OSError, match="thirteen"):
+        list(reconstruct_many({}, presets.tiny(), {"1": lambda: load(1)}))
 
 
 @pytest.fixture

@@ -67,6 +67,7 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
     found.write(**files)
     report = json.loads(files["json"].read_text())
     assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith("mean over the images of a frame")
+    assert list(evaluation.COLUMNS)[-2:] == ["patch_lpips_squeeze", "patches"]
     assert report["protocol"] == {
         "name": "lhm",
         "settings": {

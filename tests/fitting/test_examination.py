@@ -11,7 +11,8 @@ from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.keypoints.keypoints import COCO_17
+from humangs_jax.data.keypoints.keypoints import COCO_17, KeypointSet
+from humangs_jax.fitting import fit_capture
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.fit_capture import examine
 from humangs_jax.fitting.report import (
@@ -98,13 +99,34 @@ def test_exchanged_sides_are_named_before_what_they_cause(good):
     assert report.warnings[1].startswith("body and keypoints disagree in view m1v2")
 
 
+def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cameras(monkeypatch):
+    """Other exchanges are given, which costs less than to find them."""
+    names = ("left_wrist", "right_wrist", "left_hand_root", "right_hand_root", "nose")
+    capture, keypoints = person(0, 1, 2, kind=KeypointSet("wrists", names, (1, 0, 3, 2, 4)))
+    cameras, other = Swap("cameras", ("m0v0", "m0v1")), Swap("sides", ("m0v0",))
+    either = Swap("sides", ("m0v0",), instead=("m0v1",))
+    monkeypatch.setattr(fit_capture, "find_swaps", lambda *_: (cameras, Swap("sides", ("m0v1",)), either, other))
+
+    def exchange(points, _):
+        points[1, 2:4] = points[1, [3, 2]]
+
+    report = examine(capture, with_points(keypoints, exchange)).report
+    (hands,) = [swap for swap in report.swaps if swap.kind == "hands"]
+    assert report.swaps == (cameras, other, hands)
+    told = "view m0v1: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    assert told in report.warnings and f"warning: {told}" in str(report)
+
+
 def test_joints_that_turn_too_far(good):
     capture, keypoints = good
     bent = turned(turned(capture, "left_knee", 2, (-0.9, 0.0, 0.0)), "right_elbow", 0, (0.0, -0.27, 0.0))
+    for joint, beyond in (("left_knee", 0.049), ("right_knee", 0.051)):
+        bent = turned(bent, joint, 1, (-0.15 - beyond, 0.0, 0.0))
     examination = examine(bent, keypoints)
     found = {(v.frame, v.joint, v.axis): v.degrees for v in examination.report.violations}
     assert found[2, "left_knee", "x"] == pytest.approx(np.rad2deg(0.9 - 0.15), abs=0.01)
     assert found[0, "right_elbow", "y"] == pytest.approx(np.rad2deg(0.27 - 0.15), abs=0.01)
+    assert (1, "right_knee", "x") in found and (1, "left_knee", "x") not in found
     (warning,) = [warning for warning in examination.report.warnings if "beyond" in warning]
     assert warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"  # the elbow by 7 is no matter
 

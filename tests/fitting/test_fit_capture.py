@@ -207,6 +207,12 @@ def test_a_damaged_record_is_one_error(folder, fitted, tmp_path):
             read_fit_record(path / "damaged.npz")
 
 
+def test_a_record_that_lacks_a_key_names_it_and_who_writes_such_files(tmp_path):
+    np.savez(tmp_path / "fit.npz", set=np.asarray("coco17"), names=np.asarray(["a"]))
+    with pytest.raises(CaptureError, match="points: missing: expected a file that `humangs fit` wrote"):
+        read_fit_record(tmp_path / "fit.npz")
+
+
 def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
     """Of SMPL-X, whose directions are those of the shape and then those of the face."""
     fitted_to, body = [], default_body()

@@ -133,6 +133,9 @@ def test_what_cannot_be_used_is_refused_by_name():
         cameras_from_person(dataclasses.replace(seen, points=np.zeros_like(seen.points)))
     with pytest.raises(ValueError, match="no photo of the person"):
         cameras_from_person(seen.select([]))
+    for change in ({"sizes": seen.sizes[:3]}, {"photos": seen.photos[1:]}, {"names": seen.names[1:]}):
+        with pytest.raises(ValueError, match="expected points, visibility, world, sizes, focal and photos of 4 views"):
+            cameras_from_person(dataclasses.replace(seen, **change))
 
 
 def test_a_person_of_another_height_looks_the_same():

@@ -28,6 +28,7 @@ from humangs_jax.fitting.residuals.scan import (
 )
 from humangs_jax.fitting.scan_files import (
     SCAN_LANDMARKS,
+    Scan,
     checked_joints,
     joints_from_views,
     read_joints,
@@ -97,6 +98,13 @@ def off(fit, truth, millimetres=1000):
 def bare(tmp_path_factory, body, truth):
     path = written(tmp_path_factory.mktemp("bare") / "bare.ply", truth[0], body, truth[3])
     return fit_scan(path, body=body, joints=given_joints(truth), clothed=False)
+
+
+def test_a_body_that_the_last_round_still_moved_is_said_to():
+    points = np.eye(3)
+    scan = Scan(points, points, False, 0.0)
+    moving = lambda *costs: "still moving" in str(scan_fit._report(scan, False, 1.0, "y", points[0], 1.0, jnp.asarray(costs)))
+    assert moving(1.0, 0.9) and not moving(1.0, 0.99) and not moving(0.0, 0.0)
 
 
 @pytest.mark.slow
@@ -307,6 +315,11 @@ def test_what_is_no_scan_is_refused_by_name(tmp_path):
     ):
         with pytest.raises(ValueError, match=f"{name}.*({message})"):
             read_scan(tmp_path / name)
+    for name, message in (("nobody.ply", "no such file"), ("", "a folder")):
+        with pytest.raises(ValueError, match=f"{message}: expected a mesh"):
+            read_mesh(tmp_path / name)
+    with pytest.raises(ValueError, match="the faces have no area: expected a surface"):
+        sample_scan(np.zeros((4, 3)), np.asarray([[0, 1, 2], [1, 2, 3]]))
 
 
 def blocks(path, up=2):

@@ -44,6 +44,8 @@ def test_directions_are_spread_and_what_is_behind_is_not_seen():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
     nearest = np.sort(directions @ directions.T, axis=1)[:, -2]
     assert np.degrees(np.arccos(nearest)).min() > 15
+    start = [np.arctan2(x[2], x[0]) for x in (directions_around(48, turned=0.0)[0], directions[0])]
+    np.testing.assert_allclose(start, [0, np.pi * (3 - np.sqrt(5)) / 2], atol=EXACT)  # half a golden angle
     x, y = np.meshgrid(np.arange(8.0), np.arange(5.0))
     wall = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     for forward in (np.asarray([0, 0, 1.0]), np.asarray([0, 0, -1.0])):

@@ -11,7 +11,7 @@ import pytest
 from training_cases import without_upsampler
 
 from humangs_jax.io.reading import FileError
-from humangs_jax.training.checkpoint import Checkpoints, _checksum, load_config, save_config
+from humangs_jax.training.checkpoint import Checkpoints, _checksum, _without_score, load_config, save_config
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import OptimizerConfig, TrainState, make_optimizer
 
@@ -124,6 +124,13 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, 
         assert same(again.restore(state_at(0, LARGE)), state_at(3, LARGE)), damage
         again.close()
         assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], damage
+
+
+def test_scores_are_numbers(tmp_path):
+    for step, score in enumerate(("20.5", "null", '"20.5"', '"nan"', "[20.5]", "20")):
+        (tmp_path / f"{step}" / "metrics").mkdir(parents=True)
+        (tmp_path / f"{step}" / "metrics" / "metrics").write_text(f'{{"score": {score}}}')
+    assert [path.name for path in _without_score(tmp_path)] == ["1", "2", "3", "4"]
 
 
 def test_no_good_checkpoint_or_none_of_this_model_is_one_line_and_changes_nothing(tmp_path):
