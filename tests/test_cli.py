@@ -203,7 +203,7 @@ def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypat
         cli.execute(["sample"])
 
 
-def test_a_stage_on_a_terminal_counts_its_seconds(sample, monkeypatch, capsys):
+def test_a_stage_on_a_terminal_counts_its_seconds(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(progress, "TICK", 0.01)
     shown = progress.begin()
@@ -244,7 +244,7 @@ def test_a_check_goes_on_where_the_fit_does_not_know_a_view(capture_folder, tmp_
     assert "0_00" in out and (tmp_path / "check.png").is_file() and not (tmp_path / "check_fit.png").exists()
 
 
-def test_a_reader_that_has_gone_ends_a_command_quietly(tmp_path):
+def test_a_reader_that_has_gone_ends_a_command_quietly():
     """As `humangs check X | head -0`: through a real pipe, whose other end is closed at once."""
     program = subprocess.Popen(
         [sys.executable, "-m", "humangs_jax.cli", "--version"], stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -208,13 +208,15 @@ def test_lines_of_a_shell_are_read_as_a_shell_reads_them(text, expected):
     assert [" ".join(words) for words in split_shell(text)] == expected
 
 
-def test_blocks_are_whole_and_spans_are_not():
+def test_blocks_and_beginnings_of_items_are_whole_and_other_spans_are_not():
     text = "See `humangs fit\nme --scan S`.\n```sh\nhumangs fit me\n```\n```python\nhumangs = 1\n```\n~~~\nhumangs view x\n~~~\n"
-    found = commands_in(text, "page")
+    found = commands_in(text + "- `humangs check me`, `humangs tune`\n", "page")
     assert found == [
         Command("page", ("humangs", "fit", "me"), True),
         Command("page", ("humangs", "view", "x"), True),
         Command("page", ("humangs", "fit", "me", "--scan", "S"), False),
+        Command("page", ("humangs", "check", "me"), True),
+        Command("page", ("humangs", "tune"), False),
     ]
     assert filled(["SOURCE", "[--up=+z]", "integer|half", "$A/x.npz", "..."]) == ["1", "--up=+z", "integer", "1/x.npz"]
 

@@ -320,7 +320,7 @@ def test_what_is_no_video_of_a_person_is_one_line(tmp_path, monkeypatch, capsys)
         assert list(Path().iterdir()) == [Path("clips")]
 
 
-def test_folders_without_photos_and_captures_are_refused(mine, tmp_path):
+def test_folders_without_photos_and_captures_are_refused(mine):
     Path("empty").mkdir()
     for folder, problem in (
         (Path("empty"), "empty: no photo: expected"),

@@ -75,7 +75,7 @@ def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["frame_00000.png", "frame_00001.png", "notes.txt"]
 
 
-def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path, monkeypatch):
+def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path):
     (tmp_path / "a.mp4").mkdir()
     (tmp_path / "frames").write_text("mine")
     with pytest.raises(ValueError, match=r"path .*a.mp4: is a folder: expected a file name"):

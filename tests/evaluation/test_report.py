@@ -66,7 +66,7 @@ def test_the_worst_comes_first_and_columns_sort(browser, found):
     assert column(browser, "PSNR")[0] == f"{expected[0]:.2f}"
 
 
-def test_images_load_and_grow(browser, found):
+def test_images_load_and_grow(browser):
     pictures = browser.run(
         f"""for (const image of document.images) image.loading = "eager";
         await Promise.all([...document.images].map((image) => image.decode()));

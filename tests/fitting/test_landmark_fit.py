@@ -103,9 +103,11 @@ def test_a_frame_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_
 
 def test_a_confidence_of_a_quarter_is_a_quarter_of_the_cost():
     seen = jax.tree.map(lambda leaf: leaf[0], observe(NAMES[:1])[2])
-    cost = lambda seen: np.square(keypoint_residuals(model_of(), seen, jnp.ones((133, 3)), 5.0)).sum()
+    seen = replace(seen, world=jnp.asarray(np.random.default_rng(0).normal(size=(*seen.points.shape[:2], 3)), jnp.float32))
     quarter = replace(seen, confidences=seen.confidences / 4)
-    assert 0 < cost(quarter) == pytest.approx(cost(seen) / 4, rel=1e-5)
+    for residuals in (keypoint_residuals, world_residuals):
+        cost, less = (np.square(residuals(model_of(), x, jnp.ones((133, 3)), 5.0)).sum() for x in (seen, quarter))
+        assert 0 < less == pytest.approx(cost / 4, rel=1e-5)
 
 
 @pytest.mark.slow
