@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
-import jax
 import numpy as np
 from scipy import ndimage
 
+from experiments.subjects import Scores, score_tasks
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
@@ -30,13 +30,12 @@ from humangs_jax.data.photos import on_white_background, write_description
 from humangs_jax.data.views import camera_gains, multiplied
 from humangs_jax.detection.people import LANDMARK_SIZE, DetectedPerson, Networks, bilinear, detect_people, sharpened
 from humangs_jax.evaluation.cases import draw_views
-from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.arrays import write_npz
 from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
-from humangs_jax.losses.perceptual import Lpips, lpips
+from humangs_jax.losses.perceptual import Lpips
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
 FRAMES = (0, 12, 33, 66, 90)
@@ -286,7 +285,7 @@ def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 # Scores --------------------------------------------------------------------------------------------------------------
 
 
-def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[dict[str, float]]:
+def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[Scores]:
     """Of each view the PSNRs (dB) and LPIPS of the avatar of the others, against the man on white as he was photographed.
 
     Renderings are brought to the exposure of the view's camera, which is found from all photos.
@@ -306,21 +305,14 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
     return found
 
 
-def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
+def drawn_psnrs(avatar: Avatar, truth: Capture) -> Scores:
     """psnr and psnr_fg (dB), and LPIPS, of an avatar against the photos of these views, means over them."""
     return _scores(draw_views(avatar, truth).images, truth)
 
 
 def _scores(images, truth):
-    scores = score(images, truth)
-    found = {"psnr": float(scores.psnr), "psnr_fg": float(scores.psnr_fg)}
-    if (network := _alex()) is not None:
-        pairs = zip(np.clip(images, 0, 1), truth.images, strict=True)
-        found["alex"] = float(np.mean([_lpips(network, *map(np.float32, pair)) for pair in pairs]))
-    return found
-
-
-_lpips = jax.jit(lpips)
+    scores = score_tasks(images, truth, _alex())["novel"]
+    return {key: scores[name] for key, name in (("psnr", "psnr"), ("psnr_fg", "psnr_fg"), ("alex", "lpips"))}
 
 
 @functools.cache

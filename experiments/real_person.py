@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import itertools
-import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,14 +35,13 @@ from experiments.real_people import (
     video_sizes,
     without_calibration,
 )
-from experiments.results import markdown_table, write_json
+from experiments.results import markdown_table
 from experiments.subjects import shipped_digest
 from humangs_jax.apps.start import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.core.processes import enable_compile_cache
-from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.scores import mean_scores
@@ -55,13 +53,13 @@ from humangs_jax.refinement.refine import refine
 
 PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2), "alex": ("LPIPS alex", 3)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
-SECONDS = {"first": "first time, s", "compiled": "compiled, s", "first_processor": "processor: first, s"}
-SECONDS |= {"compiled_processor": "compiled, s", "load": "load"}
+SECONDS = {"first": ("first time, s", 0), "compiled": ("compiled, s", 0)}
+SECONDS |= {"first_processor": ("processor: first, s", 0), "compiled_processor": ("compiled, s", 0), "load": ("load", 0)}
 IOUS = {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)}
 TABLES = (
     (("calibrated", "uncalibrated", "poses", "moments"), IOUS | PSNRS | CAMERAS),
     (("rooms",), {"iou": IOUS["iou"]} | PSNRS | CAMERAS),
-    (("start",), {key: (heading, 0) for key, heading in SECONDS.items()}),
+    (("start",), SECONDS),
 )
 """First words of rows, and the columns of their scores: heading and digits."""
 SEEDS = (4_000_100, 4_000_101, 4_000_102)
@@ -227,42 +225,25 @@ def start(man: Man) -> Cases:
 ROWS = (calibrated, poses, uncalibrated, moments, rooms, start)
 
 
-def measure(file: Path, label: str, cases: Cases) -> dict[str, Any]:
-    """Scores by label, row and case: those of the file, and of this label the missing ones, written after each."""
-    results: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-    settings = {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)}
-    rows = results.setdefault(label, {"settings": settings, "rows": {}})["rows"]
-    for row, case, scores in bar(list(cases), desc="real person", unit="case"):
-        found = rows.setdefault(row, {})
-        if case not in found:
-            found[case] = scores()
-            write_json(file, results)
-    return results
-
-
-def section(results: dict[str, Any]) -> str:
+def section(rows: dict[str, dict[str, Any]]) -> str:
     """The tables of the page: the man, people in rooms, seconds; means over the cases of each row."""
-    return "\n\n".join(filter(None, (_table(results, kinds, columns) for kinds, columns in TABLES)))
+    return "\n\n".join(filter(None, (_table(rows, kinds, columns) for kinds, columns in TABLES)))
 
 
-def _table(results, kinds, columns):
-    rows = []
-    for label, each in results.items():
-        for row, cases in each["rows"].items():
-            if row.split(",")[0] in kinds and cases:
-                means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
-                known = [(means.get(key), digits) for key, (_, digits) in columns.items()]
-                rows.append([row, label, len(cases), *("-" if v is None else f"{v:.{digits}f}" for v, digits in known)])
-    header = ["row", "state", "cases", *(heading for heading, _ in columns.values())]
-    return markdown_table(header, rows, "ll" + "r" * (len(header) - 2)) if rows else ""
+def _table(rows, kinds, columns):
+    lines = []
+    for row, cases in rows.items():
+        if row.split(",")[0] in kinds:
+            means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
+            known = [(means.get(key), digits) for key, (_, digits) in columns.items()]
+            lines.append([row, len(cases), *("-" if v is None else f"{v:.{digits}f}" for v, digits in known)])
+    return markdown_table(["row", "cases", *(heading for heading, _ in columns.values())], lines) if lines else ""
 
 
 @entry
 def real_person(
     run: Run,
     data: Path,
-    out: Path,
-    label: str = "now",
     rows: tuple[str, ...] = tuple(each.__name__ for each in ROWS),
     frames: tuple[int, ...] = FRAMES,
     pictures: Path | None = None,
@@ -273,13 +254,10 @@ def real_person(
     calibrated, the published calibration: held out, cameras and body know all four photos, the avatar three; unseen, nothing
     knows the fourth photo; where its camera stands is told by cameras that all frames have refined together. poses: the avatar
     of one frame in the poses of the others. uncalibrated: cameras from the person. moments: the same, of photos that each show
-    another moment.
-    rooms: synthetic people in photographed rooms. start: `humangs start` on four photos of 12 megapixels, seconds.
+    another moment. rooms: synthetic people in photographed rooms. start: seconds of `humangs start` on photos of 12 megapixels.
 
     Options:
     data: where `pose2sim` is downloaded to and what is made of it stays
-    out: numbers are written here; a run of the same --label goes on where an earlier one stopped
-    label: of this state of the package
     rows: how their names begin, as "calibrated, refine"
     frames: of the videos, 0 to 99
     pictures: JPEG of the avatar from all sides, and walking
@@ -290,8 +268,13 @@ def real_person(
         raise ValueError(f"--rows {unknown[0]}: expected beginnings of rows: {', '.join(names)}")
     enable_compile_cache()
     man = Man(data, frames)
-    wanted = [each(man) for each in ROWS if any(row.startswith(each.__name__) for row in rows)]
-    results = measure(out, label, (case for case in itertools.chain(*wanted) if case[0].startswith(rows)))
+    wanted = itertools.chain(*(each(man) for each in ROWS if any(row.startswith(each.__name__) for row in rows)))
+    cases = {f"{row}: {case}": scores for row, case, scores in wanted if row.startswith(rows)}
+    settings = {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)}
+    results: dict[str, dict[str, Any]] = {}
+    for name, scores in run.rows(cases, settings).items():
+        row, _, case = name.partition(": ")
+        results.setdefault(row, {})[case] = scores
     if pictures:
         body = man.body(man.numbers[0], "detected")
         draw_sheet(avatar_of(body), body, pictures)

@@ -251,29 +251,6 @@ def narrow_everything(dtype: type) -> Scene:
     return narrow(dtype, "K", "pose", "background")
 
 
-def anything(seed: int, focal: float, nearest: float, farthest: float, smallest: float, largest: float) -> Scene:
-    """A random scene: every Gaussian has its own depth and three scales (metres), log-uniform within these ranges, any
-    opacity (some 0, 1 and 1 - 1e-7), a quaternion of any norm from 1e-20 to 1e15, and a place on or beside the image.
-    """
-    rng = np.random.default_rng(seed)
-    scene = ordinary(seed)
-    K = scene.K.copy()
-    K[:2, :2] *= focal / FOCAL
-    z = np.exp(rng.uniform(np.log(nearest), np.log(farthest), COUNT))
-    size = np.array([WIDTH, HEIGHT])
-    slopes = (rng.uniform(-0.3 * size, 1.3 * size, (COUNT, 2)) - K[:2, 2]) / K[[0, 1], [0, 1]]
-    special = rng.uniform(size=COUNT) < 0.2
-    opacities = np.where(special, rng.choice([0, 1, 1 - 1e-7], COUNT), rng.uniform(0, 1, COUNT))
-    scene = changed(
-        scene,
-        means=np.concatenate([slopes * z[:, None], z[:, None]], axis=1),
-        scales=np.exp(rng.uniform(np.log(smallest), np.log(largest), (COUNT, 3))),
-        quats=rng.normal(size=(COUNT, 4)) * 10 ** rng.uniform(-20, 15, (COUNT, 1)),
-        opacities=opacities,
-    )
-    return dataclasses.replace(scene, K=K, pose=UNTURNED, unit=float(np.median(z)))
-
-
 def _cases() -> list[Case]:
     one = functools.partial
     ulp = lambda towards: float(np.nextafter(np.float32(NEAR), np.float32(towards)))

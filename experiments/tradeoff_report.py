@@ -11,14 +11,11 @@ from humangs_jax.network.runtime import Runtime
 
 SIZE = 512
 """Side of the frames that points are compared at."""
-STARTS = ("network", "random colors", "vertex-color baseline")
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A way to make an avatar and draw it. size: side of the frames, pixels. start: of `STARTS`: the last ones are to compare
-    with.
-    """
+    """A way to make an avatar and draw it. size: side of the frames, pixels. start: "network", or of `NAIVE`, to compare with."""
 
     name: str
     knob: str

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.real_capture import VideoCamera, background, careful_mask, read_cameras
 from experiments.real_people import camera_errors, seen_from, to_reference
-from experiments.real_person import measure
+from experiments.real_person import section
 from humangs_jax.fitting.triangulation import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
@@ -86,13 +86,7 @@ def test_cameras_are_compared_after_one_similarity():
     np.testing.assert_allclose(found.cam_from_world[0], own.cam_from_world[3], atol=FLOAT32)
 
 
-def test_a_run_goes_on_where_it_stopped(tmp_path):
-    file, calls = tmp_path / "real.json", []
-
-    def scores():
-        calls.append(1)
-        return {"iou": 0.75, "psnr": 19.5, "each_iou": [0.7, 0.8]}
-
-    for frames in (["33"], ["33", "66"]):
-        measure(file, "now", (("calibrated, fit, detected", frame, scores) for frame in frames))
-    assert len(calls) == 2
+def test_rows_are_means_over_their_cases_in_the_table_of_their_kind():
+    cases = {"33": {"iou": 0.7, "psnr": 19.5, "each_iou": [0.7, 0.8]}, "66": {"iou": 0.8, "psnr": 20.5, "each_iou": [0.9]}}
+    text = section({"calibrated, fit, detected": cases, "start": {"0": {"first": 125.0, "load": 2.0}}})
+    assert "| calibrated, fit, detected | 2 | 0.750 | - | 20.0 | - |" in text and "| start | 1 | 125 | - | - | - | 2 |" in text

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import real_person, refinement, splatting, tradeoff_report
+from experiments import refinement, splatting, tradeoff_report
 from experiments.paper import cost, train_all
 from experiments.render_tables import render_pages
 from experiments.results import blocks_of, json_text, publish, text_of
@@ -45,7 +45,7 @@ def section_of(name, numbers):
         result = stored("tradeoff")["numbers"]
         table = tradeoff_report.preset_table if name == "tradeoff_presets" else tradeoff_report.point_table
         return table(tradeoff_report.rows_of(result), result)
-    makers = {"paper": train_all.table, "paper_cost": cost.text_of, "real_person": real_person.section}
+    makers = {"paper": train_all.table, "paper_cost": cost.text_of}
     return (makers | {"splatting_tradeoff": splatting.knobs_table})[name](numbers)
 
 
@@ -56,7 +56,7 @@ def stored(name):
 TABLES = ("refinement", "refinement_few", "refinement_off", "tradeoff", "tradeoff_presets", "splatting_tradeoff")
 
 
-@pytest.mark.parametrize("name", [*TABLES, "paper", "paper_cost", "real_person"])
+@pytest.mark.parametrize("name", [*TABLES, "paper", "paper_cost"])
 def test_a_table_is_what_its_experiment_makes_of_the_numbers(name):
     assert section_of(name, stored(name)["numbers"]) == text_of(stored(name)["blocks"])
 
