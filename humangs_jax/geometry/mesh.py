@@ -53,12 +53,14 @@ def in_front(
     """Which of some points are at most `behind` behind the nearest of all points in their cell of a grid across `forward`."""
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])
-    x, y, depths = frame @ np.concatenate([some, points]).T
-    column, row = (((values - values.min()) / cell).astype(int) for values in (x, y))
-    cells, count = column * (row.max() + 1) + row, len(some)
-    nearest = np.full(cells.max() + 1, np.inf)
-    np.minimum.at(nearest, cells[count:], depths[count:])
-    return depths[:count] < nearest[cells[:count]] + behind
+    own, others = (frame @ vectors.T for vectors in (some, points))
+    low = np.minimum(own[:2].min(axis=1), others[:2].min(axis=1))
+    cells = lambda placed: ((placed[:2] - low[:, None]) / cell).astype(int)
+    (column, row), (columns, rows) = cells(own), cells(others)
+    height = 1 + max(row.max(), rows.max())
+    nearest = np.full((1 + max(column.max(), columns.max())) * height, np.inf)
+    np.minimum.at(nearest, columns * height + rows, others[2])
+    return own[2] < nearest[column * height + row] + behind
 
 
 def smallest_turns(
