@@ -11,7 +11,7 @@ import numpy as np
 from experiments.harness import Run, entry, means
 from experiments.pictures import details, frontal_view, write_triples
 from experiments.refinement import with_body_off
-from experiments.results import markdown_table
+from experiments.results import cells, markdown_table
 from experiments.subjects import TASKS, People, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
@@ -83,7 +83,7 @@ def appearance(
     for case in [case for case in numbers["all"] if case != "loose"]:
         size, wrong, task = case.split()
         for (group, mean), name in itertools.product(numbers.items(), VARIANTS):
-            table.append([f"{size} px", f"{wrong} mm", TASKS[task], group, name, *cells(mean[case][name])])
+            table.append([f"{size} px", f"{wrong} mm", TASKS[task], group, name, *cells(mean[case][name], SHOWN)])
     header = ["photos", "body off", "views", "people", "avatar", *(heading for heading, _ in SHOWN.values())]
     about = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other cameras."
     text = f"{about}\n\n{markdown_table(header, table, 'lllll' + 'r' * len(SHOWN))}"
@@ -140,8 +140,3 @@ def scores_of(images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[
         found[net] = float(np.mean([_lpips(weights, *pair) for pair in zip(images, truth.images, strict=True)]))
         found[f"{net}_head"] = float(np.mean([_lpips(weights, *pair) for pair in zip(*heads, strict=True)]))
     return found
-
-
-def cells(scores: dict[str, float]) -> list[str]:
-    """Of `SHOWN`, what there is."""
-    return [f"{scores[key]:.{digits}f}" for key, (_, digits) in SHOWN.items() if key in scores]

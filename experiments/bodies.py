@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.harness import Run, entry, means
-from experiments.quality import COLUMNS, cells
-from experiments.results import markdown_table
+from experiments.quality import COLUMNS
+from experiments.results import cells, markdown_table
 from experiments.subjects import RING, TASKS, People, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.joints import JOINT_NAMES
@@ -67,10 +67,11 @@ def bodies_table(bodies: dict[str, Any]) -> str:
     """A row a body, and how well it matches."""
     tasks = [task for task in TASKS if task in bodies[PAINTED]]
     keys = [key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
+    columns = {key: COLUMNS[key] for key in keys}
     header = ["body", "vertices", "that carry Gaussians"]
-    header += [f"{TASKS[task]}: {COLUMNS[key][0]}" for task in tasks for key in keys]
+    header += [f"{TASKS[task]}: {heading}" for task in tasks for heading, _ in columns.values()]
     facts = lambda body: [body.get("body_vertices", "-"), body.get("vertices", "-")]
-    scores = lambda body: [number for task in tasks for number in cells(body[task], keys)]
+    scores = lambda body: [number for task in tasks for number in cells(body[task], columns)]
     return markdown_table(header, [[name, *facts(body), *scores(body)] for name, body in bodies.items()])
 
 

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 from experiments.changes import grown
 from experiments.harness import Run, entry, figure, means
 from experiments.pictures import cropped, frontal_view, write_triples
-from experiments.results import markdown_table, page_of
-from experiments.subjects import RING, TASKS, HeldOut, People, Scores, score_tasks, shipped_digest
+from experiments.results import cells, markdown_table, page_of
+from experiments.subjects import RING, TASKS, HeldOut, People, score_tasks, shipped_digest
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import cut_out
@@ -85,21 +84,15 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
     """
     mean = {n: means(list(rows.values())) for n, rows in by_views.items()}
     tasks = [task for task in TASKS if task in mean[chosen]]
-    keys = [key for key in COLUMNS if mean[chosen][tasks[0]].get(key) is not None]
-    rows = [[TASKS[task], n, *cells(mean[n][task], keys)] for task in tasks for n in mean]
+    columns = {key: column for key, column in COLUMNS.items() if mean[chosen][tasks[0]].get(key) is not None}
+    rows = [[TASKS[task], n, *cells(mean[n][task], columns)] for task in tasks for n in mean]
     return "\n\n".join(
         (
             about,
-            markdown_table(["task", "photos", *(COLUMNS[key][0] for key in keys)], rows),
+            markdown_table(["task", "photos", *(heading for heading, _ in columns.values())], rows),
             " ".join(verdict(by_views, chosen, task) for task in tasks),
         )
     )
-
-
-def cells(scores: Scores, keys: Sequence[str]) -> list[str]:
-    """Numbers with their digits; a dash for what is missing."""
-    values = [(scores.get(key), COLUMNS[key][1]) for key in keys]
-    return ["-" if value is None else f"{value:.{digits}f}" for value, digits in values]
 
 
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:

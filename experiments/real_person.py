@@ -35,7 +35,7 @@ from experiments.real_people import (
     video_sizes,
     without_calibration,
 )
-from experiments.results import markdown_table
+from experiments.results import cells, markdown_table
 from experiments.subjects import shipped_digest
 from humangs_jax.apps.start import better_body
 from humangs_jax.avatar.avatar import Avatar
@@ -235,8 +235,7 @@ def _table(rows, kinds, columns):
     for row, cases in rows.items():
         if row.split(",")[0] in kinds:
             means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
-            known = [(means.get(key), digits) for key, (_, digits) in columns.items()]
-            lines.append([row, len(cases), *("-" if v is None else f"{v:.{digits}f}" for v, digits in known)])
+            lines.append([row, len(cases), *cells(means, columns)])
     return markdown_table(["row", "cases", *(heading for heading, _ in columns.values())], lines) if lines else ""
 
 

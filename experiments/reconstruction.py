@@ -1,8 +1,8 @@
 """Time, arithmetic and memory of one reconstruction: photos and body in, canonical Gaussians out.
 
-The subject is the person that ships with the package, as the shipped weights see them: reconstructed from the four demo photos,
-drawn from cameras of the published protocol. What the photos show changes no cost but one: how many patches the person touches.
-Random weights cost what trained ones cost. Operations are counted from the traced programs, loops included (`costs.py`).
+The subject is the person of the demo, seen by cameras of the published protocol. What the photos show changes no cost but one:
+how many patches the person touches. Random weights cost what trained ones cost. Operations are counted from the traced programs,
+loops included (`costs.py`).
 """
 
 import functools
@@ -18,27 +18,18 @@ import numpy as np
 from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
-from experiments.subjects import shipped_person
 from experiments.timing import medians
-from humangs_jax.avatar.animate import animate
-from humangs_jax.avatar.frames import draw_gaussians
 from humangs_jax.avatar.reconstruct import reconstruct_views, stack_captures
-from humangs_jax.body.model import pose_body, shape_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
-from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import needed_tokens
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.weights import expected_variables, load_weights
-from humangs_jax.people.surroundings import VERTICAL_FOV, bounding_sphere
 from humangs_jax.rendering.buffers import round_up
 
-DISTANCE_FACTOR = 1.8
-"""The nearest of the published protocol (1.8 to 2.2)."""
-ELEVATION = np.deg2rad(5.0)
 MATMUL_SHAPE = (4096, 768, 3072)
 """A product of the published network's MLP at 256 x 256: what "matrix-product peak" means here."""
 TOKENS = ("all", "foreground")
@@ -46,35 +37,12 @@ LOG_SCALE, HEAD_SCALE = -4.6, 0.05
 """Bias of the scales before their softplus, and how much weaker random geometry heads are than other random layers."""
 
 
-def benchmark_views(views: int, size: int) -> tuple[Any, Any]:
-    """(body, `SubjectViews`) of the benchmark subject: cameras evenly around, one pose."""
-    avatar, capture = shipped_person(), load_capture(DEMO_CAPTURE)
-    pose, body = capture.pose(0), capture.body
-    betas = jnp.asarray(capture.betas)
-    posed = np.asarray(pose_body(body, shape_body(body, betas), pose).vertices)
-    center, radius = bounding_sphere(posed)
-    K = intrinsics_from_fov(VERTICAL_FOV, size, size)
-    azimuths = jnp.arange(views, dtype=jnp.float32) * (2 * np.pi / views)
-    target = jnp.asarray(center, jnp.float32)
-    cameras = orbit(target, float(DISTANCE_FACTOR * radius), azimuths, float(ELEVATION), K, size, size)
-    gaussians = animate(avatar, pose)
-    drawn = list(draw_gaussians(iter([gaussians] * views), (cameras[i] for i in range(views))))
-    repeat = lambda x: jnp.broadcast_to(jnp.asarray(x), (views, *np.shape(x)))
-    return body, SubjectViews(
-        images=jnp.stack([jnp.clip(x.rgb, 0, 1) for x in drawn]),
-        masks=jnp.stack([x.alpha for x in drawn]),
-        cameras=cameras,
-        rotations=repeat(pose.rotations),
-        translations=repeat(pose.translation),
-        betas=betas,
-    )
-
-
 def benchmark_inputs(config: Any, views: int, size: int) -> Any:
-    """`HumanGSInputs` of the benchmark subject, as a network of this configuration wants them."""
-    body, photos = benchmark_views(views, size)
+    """`HumanGSInputs` of the demo's photos, in turns until there are that many, as a network of this configuration wants them."""
+    capture = load_capture(DEMO_CAPTURE)
+    photos = standardize(capture.select([i % capture.view_count for i in range(views)]), size)
     prepare = jax.jit(prepare_inputs, static_argnames="config")
-    return jax.block_until_ready(prepare(gaussian_body(body, config), photos, config))
+    return jax.block_until_ready(prepare(gaussian_body(capture.body, config), photos, config))
 
 
 def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.harness import Run, entry, figure, means
 from experiments.pictures import cropped, details, frontal_view, write_triples
-from experiments.results import REPOSITORY, markdown_table, significant
+from experiments.results import REPOSITORY, cells, markdown_table, significant
 from experiments.subjects import TASKS, People, score_tasks, shipped_digest, task_views
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.pytree import replace
@@ -228,7 +228,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
     if people["settings"]["weights"] != refined["settings"]["weights"]:
         raise ValueError("evaluation_views and appearance are of different weights: measure them again")
     scored = lambda size, task: refined["means"]["all"][f"{size} 0 {task}"]["default"]
-    columns = {"psnr": 1, "psnr_fg": 1, "alex": 3}
+    columns = {"psnr": ("PSNR", 1), "psnr_fg": ("foreground PSNR", 1), "alex": ("LPIPS (Alex)", 3)}
     own = {"psnr": "psnr", "psnr_fg": "psnr_fg"} | ({"alex": "lpips"} if people["settings"].get("lpips_net") == "alex" else {})
     feed_forward = people["by_views"]["4"]["novel"]
     rows = {
@@ -239,9 +239,8 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         f"the demo's person, {demo['image_size'][0]} px, refined for 15 s": demo["refined"],
         "vertex-color baseline, 256 px": {name: feed_forward.get(f"baseline_{key}") for name, key in own.items()},
     }
-    shown = lambda scores: ["" if scores.get(key) is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
-    header = ["", "PSNR", "foreground PSNR", "LPIPS (Alex)"]
-    return markdown_table(header, [[name, *shown(scores)] for name, scores in rows.items()])
+    header = ["", *(heading for heading, _ in columns.values())]
+    return markdown_table(header, [[name, *cells(scores, columns, "")] for name, scores in rows.items()])
 
 
 def readme_times(demo: dict[str, Any]) -> str:

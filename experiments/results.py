@@ -19,7 +19,7 @@ import platform
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,12 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]], alig
     """A table. align holds "l" or "r" for each column; by default the first is aligned to the left, others to the right."""
     rule = [ALIGNMENTS[side] for side in align or default_alignment(header)]
     return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in (header, rule, *rows))
+
+
+def cells(numbers: Mapping[str, float | None], columns: Mapping[str, tuple[str, int]], missing: str = "-") -> list[str]:
+    """Numbers of a row, by columns: key -> heading and digits."""
+    values = ((numbers.get(key), digits) for key, (_, digits) in columns.items())
+    return [missing if value is None else f"{value:,.{digits}f}" for value, digits in values]
 
 
 def significant(value: float, digits: int = 2) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.harness import Run, figure, means, staircase
-from experiments.results import REPOSITORY, markdown_table, significant, write_json
+from experiments.results import REPOSITORY, cells, markdown_table, significant, write_json
 from humangs_jax.apps.settings import PRESETS, Settings
 from humangs_jax.network.runtime import Runtime
 
@@ -215,20 +215,15 @@ def about(result: dict[str, Any]) -> str:
 
 def numbers(row: Row) -> list[str]:
     share = lambda key: significant(row[key]) if row.get(key) is not None else ""
-    return [share("reconstruct"), share("frame")] + [
-        f"{row[key]:,.{digits}f}" if row.get(key) is not None else ""
-        for key, digits in (("memory_mb", 0), ("file_mb", 2), ("gaussians", 0))
-    ]
+    return [share("reconstruct"), share("frame"), *cells(row, SIZES, "")]
 
 
 def scores(row: Row) -> list[str]:
-    if row["novel"] is None:
-        return [""] * (len(TASKS) * len(SCORES))
-    values = [(row[task].get(key), digits) for task in TASKS for key, (_, digits) in SCORES.items()]
-    return ["" if value is None else f"{value:.{digits}f}" for value, digits in values]
+    return [cell for task in TASKS for cell in cells(row[task] or {}, SCORES, "")]
 
 
-MEASURES = ["reconstruction", "frame", "MiB", "file, MiB", "Gaussians"]
+SIZES = {"memory_mb": ("MiB", 0), "file_mb": ("file, MiB", 2), "gaussians": ("Gaussians", 0)}
+MEASURES = ["reconstruction", "frame", *(heading for heading, _ in SIZES.values())]
 HEADINGS = [
     f"{name}: {heading}" if i == 0 else heading for name in TASKS.values() for i, (heading, _) in enumerate(SCORES.values())
 ]

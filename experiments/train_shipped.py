@@ -16,7 +16,6 @@ humangs_jax/assets/weights.md.
 import logging
 import os
 import signal
-import sys
 import threading
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,8 +34,6 @@ from humangs_jax.people.writer import Layout, write_set
 from humangs_jax.training.config import TrainConfig, small
 from humangs_jax.training.loop import TrainingInterrupted, train
 from humangs_jax.training.sources import on_the_fly_people, training_people
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 VALIDATION_SUBJECTS = 8
 

@@ -74,12 +74,10 @@ def random_networks(config: Any) -> Any:
 
 
 def written_subject(folder: Path, config: Any, body: Any) -> Path:
-    """The capture folder of a synthetic person with as many views as an example takes; made if it is not there."""
+    """Writes the capture of a synthetic person with as many views as an example takes; its folder in `folder`."""
     views = config.views.input_counts[0] + config.views.target_count
-    path = folder / f"{config.model.conventions.image_size}_{views}"
-    if not path.exists():
-        write_person(path, 0, body, Layout(config.model.conventions.image_size, views=views))
-    return path
+    write_person(folder / "person", 0, body, Layout(config.model.conventions.image_size, views=views))
+    return folder / "person"
 
 
 CASES = {

@@ -40,7 +40,7 @@ from experiments.paper.bench import (
     variants,
 )
 from experiments.paper.people import SIZE, write_plain
-from experiments.results import markdown_table, write_json
+from experiments.results import cells, markdown_table, write_json
 from experiments.systems import ADDED
 from humangs_jax.core.processes import enable_compile_cache
 from humangs_jax.io.reading import read_json
@@ -146,19 +146,17 @@ def table(report: Mapping[str, Any]) -> str:
             lines.append([name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute])
             continue
         means = {key: np.mean([headline(x)["reconstruction"][key] for x in rows]) for key in SCORES}
-        scores = [f"{means[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
         moved = "-"
         if "animation" in headline(rows[0]):
             moved = f"{np.mean([headline(x)['animation']['psnr_fg'] for x in rows]):.2f}"
-        lines.append([name, last["photos"], len(rows), *scores, moved, str(changes.get(name, "")), steps, *compute])
+        lines.append([name, last["photos"], len(rows), *cells(means, SCORES), moved, str(changes.get(name, "")), steps, *compute])
         for kind in (COUNTS, NEAR):
             if set(kind) <= set(rows[0]["scores"]):
                 means = [np.mean([x["scores"][test]["reconstruction"]["psnr_fg"] for x in rows]) for test in kind]
                 counted.append([name, "near" if kind == NEAR else "standard", *(f"{x:.2f}" for x in means)])
-    base = report["painted"]["test"]
-    shown = [f"{np.mean(base[str(PHOTOS)]['reconstruction'][key]):.{digits}f}" for key, (_, digits) in SCORES.items()]
-    moved = f"{np.mean(base[str(PHOTOS)]['animation']['psnr_fg']):.2f}"
-    lines.append([PAINTED, PHOTOS, "", *shown, moved, "", "", "", ""])
+    base = report["painted"]["test"][str(PHOTOS)]
+    means, moved = ({key: np.mean(x) for key, x in base[task].items()} for task in TASKS)
+    lines.append([PAINTED, PHOTOS, "", *cells(means, SCORES), f"{moved['psnr_fg']:.2f}", "", "", "", ""])
     header = ["variant", "photos", "seeds", *(heading for heading, _ in SCORES.values()), "another pose, foreground"]
     header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
     settings = report["settings"]
@@ -201,13 +199,13 @@ def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list
         for kind, task, score in itertools.product((COUNTS, NEAR), TASKS, ("psnr", "lpips_alex")):
             sign, digits = (1, 2) if score == "psnr" else (-1, 4)
             before = kind if other != REFERENCE else ("", *kind)
-            cells = []
+            gains = []
             for a, b in zip(kind, before, strict=False):
                 known = scored(REFERENCE, a, task) and scored(other, b, task)
                 gain = difference(runs, (REFERENCE, a), (other, b), task, score) if known else None
-                cells.append("-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits))
-            if set(cells) != {"-"}:
-                lines.append(["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *cells])
+                gains.append("-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits))
+            if set(gains) != {"-"}:
+                lines.append(["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *gains])
         if lines:
             found[part] = (["cameras", "shown", "gain", *COUNTS], lines)
     return found
