@@ -203,7 +203,7 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
 
     code, out, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "1e7", "--frame-ms", "1e6")
     assert code == 0, err
-    assert "refined: all photos" in out and "is the best of all settings" in out
+    assert "refined\n" in out and "is the best of all settings" in out
     assert load_settings(tmp_path / "tuned.json") == front[1].settings
 
     run_with = lambda *words: run(monkeypatch, capsys, *words, "--config", "tuned.json")

@@ -93,7 +93,7 @@ def mixture(tmp_path_factory):
     """Two people on the fly and one on disk, and their body."""
     body, folder = load_body(), tmp_path_factory.mktemp("demo")
     save_capture(folder, load_capture("demo_capture").resized(SIZE))
-    bank = build_bank(SPLITS["train"][:2], body, "train", texture_size=64, pose_count=2)
+    bank = build_bank(SPLITS["train"][:2], body, "train", texture_size=128, pose_count=2)
     return mixed_people([captured_people([folder], body), on_the_fly_people(bank)], [1, 1]), body
 
 
