@@ -193,16 +193,22 @@ PLAIN = dataclasses.replace(
 
 @pytest.fixture
 def plain_update(monkeypatch):
-    """f(state) -> the state after `update` with a gradient of 1, and the keys that it gave to the subjects of a batch of 2."""
-    keys = []
+    """f(state, loss) -> the state after `update` with a gradient of 1 and statistics that are larger by 1, and the keys that it
+    gave to the subjects of a batch of 2.
+    """
 
-    def gradients(params, batch_stats, body, batch, subjects, *_):
-        keys.append(jax.random.key_data(subjects))
-        return jnp.zeros(()), jax.tree.map(jnp.ones_like, params), batch_stats, {}
+    def updated(state, loss=0.0):
+        keys = []
 
-    monkeypatch.setattr(step, "batch_gradients", gradients)
-    batch = SimpleNamespace(inputs=SimpleNamespace(betas=jnp.zeros((2, 1))))
-    return lambda state: (inspect.unwrap(update)(state, batch, None, LossNetworks(), seed_numbers(0), PLAIN)[0], keys[-1])
+        def gradients(params, batch_stats, body, batch, subjects, *_):
+            keys.append(jax.random.key_data(subjects))
+            return jnp.asarray(loss), jax.tree.map(jnp.ones_like, params), jax.tree.map(lambda x: x + 1, batch_stats), {}
+
+        monkeypatch.setattr(step, "batch_gradients", gradients)
+        batch = SimpleNamespace(inputs=SimpleNamespace(betas=jnp.zeros((2, 1))))
+        return inspect.unwrap(update)(state, batch, None, LossNetworks(), seed_numbers(0), PLAIN)[0], keys[-1]
+
+    return updated
 
 
 def test_every_step_and_every_subject_has_random_numbers_of_its_own(plain_update):
@@ -220,6 +226,13 @@ def test_the_average_forgets_where_it_started(plain_update):
     for _ in range(10):
         state, _ = plain_update(state)
     assert abs(float(state.ema_params["x"][0])) < 20  # of the 100 that the average began with
+
+
+def test_statistics_of_a_bad_step_are_not_kept(plain_update):
+    state = init_state(PLAIN, {"params": {"x": jnp.zeros(1)}, "batch_stats": {"mean": jnp.zeros(1)}})
+    for loss, mean in ((0.0, 1), (np.nan, 1), (0.0, 2)):
+        state, _ = plain_update(state, loss)
+        assert float(state.batch_stats["mean"][0]) == mean
 
 
 @pytest.mark.parametrize("size", [1, 2, 4])
