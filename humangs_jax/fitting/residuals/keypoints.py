@@ -66,7 +66,7 @@ def make_observations(
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
     """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c = 1), and the noise of all."""
-    scale = np.asarray([cameras.width / photos.width, cameras.height / photos.height])
+    scale = np.asarray([cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype)
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
     arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
     noise = expected_noise(points[None], keypoints.confidences[None])
