@@ -1,14 +1,17 @@
 """The size and shape of the project, counted from its files."""
 
 import ast
+import inspect
 import json
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any
+from unittest import mock
 
 from experiments.harness import Run, entry
 from experiments.results import REPOSITORY, markdown_table
@@ -18,10 +21,13 @@ LONG = 500
 """Lines from which on a module is long."""
 GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
 """Pages that scripts write."""
+TERMS = "rounds of the learned|on the person(?!')|fog|painted body|yardstick|unseen poses|new views|psnr_mask|psnr_foreground"
+DIALECT = re.compile(rf"\b({TERMS}|colour\w*)\b")
+"""Words that the field does not use."""
 
 
 @entry
-def count(run: Run, before: Path | None = None, details: bool = False) -> None:
+def count(run: Run, before: Path | None = None, details: bool = False, walks: bool = False) -> None:
     """Lines, modules, words, annotations, importers and circles of imports of package, tests, experiments and docs.
 
     Only files that git knows. "Annotated": all arguments and the result; functions in functions, lambdas and __methods__ do not
@@ -31,10 +37,11 @@ def count(run: Run, before: Path | None = None, details: bool = False) -> None:
 
     Options:
     before: another checkout of the project, whose numbers stand beside these
-    details: names of long modules, of those with one importer, and of circles
+    details: names of long modules, of those with one importer, of circles, and of the functions of walks
+    walks: also how many functions a datum enters, see `walked`; a minute, and of this checkout alone
     """
     columns = {"before": measure(before)} if before else {}
-    columns["now"] = measure(REPOSITORY)
+    columns["now"] = measure(REPOSITORY) | (all_walks() if walks else {})
     if details:
         for name, value in columns["now"].items():
             if isinstance(value, list):
@@ -67,6 +74,9 @@ def measure(root: Path) -> dict[str, Any]:
     found["docs: words by hand, without code and generated tables"] = sum(len(text.split()) for text in by_hand.values())
     found["docs: words of README"] = len((root / "README.md").read_text().split())
     found["docs: tables on pages written by hand"] = sum(text.count("| --- ") > 0 for text in by_hand.values())
+    found["docs: terms of another dialect"] = [
+        f"{name}: {term}" for name, text in by_hand.items() for term in sorted(set(DIALECT.findall(text)))
+    ]
     found["docs: broken links"] = [
         link for name in known if name.endswith((".md", ".ipynb")) for link in broken_links(root, name)
     ]
@@ -222,3 +232,64 @@ def public_names(root: Path) -> list[str]:
     """What `import humangs_jax` offers."""
     tree = ast.parse((root / PACKAGE / "__init__.pyi").read_text())
     return [each.asname or each.name for node in tree.body if isinstance(node, ast.ImportFrom) for each in node.names]
+
+
+def walked(call: Callable[[], object], *datum: type) -> list[str]:
+    """Functions of the package that a datum enters while `call` runs and JAX traces: each counts once, wherever it is called.
+
+    A function counts that gets an object of one of the classes as an argument, also in a tuple, list or dict. Methods of the
+    datum itself do not, nor lambdas, nor what only JAX calls, to take pytrees apart.
+    """
+    root, found = str(REPOSITORY / PACKAGE), {}
+    holds = lambda value: (
+        isinstance(value, datum)
+        or any(
+            isinstance(each, (*datum, tuple)) and holds(each)
+            for each in (value.values() if isinstance(value, dict) else value if isinstance(value, tuple | list) else ())
+        )
+    )
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        inside = code.co_filename.startswith(root) and "<lambda>" not in code.co_qualname and "flatten" not in code.co_name
+        if event == "call" and inside:
+            arguments = code.co_argcount + code.co_kwonlyargcount + bool(code.co_flags & inspect.CO_VARARGS)
+            given = code.co_varnames[:arguments]
+            if any(name != "self" and holds(frame.f_locals.get(name)) for name in given):
+                found[f"{Path(code.co_filename).stem}.{code.co_qualname}"] = None
+
+    sys.setprofile(watch)
+    try:
+        call()
+    finally:
+        sys.setprofile(None)
+    return list(found)
+
+
+def all_walks() -> dict[str, list[str]]:
+    """The walks of photos to an avatar, of Gaussians to an image, and of a training example to the loss."""
+    import jax
+
+    import humangs_jax as hg
+    from humangs_jax.data.loading import Example
+    from humangs_jax.data.views import SubjectViews, gaussian_body, standardize
+    from humangs_jax.network.parts import Drawn, HumanGSInputs
+    from humangs_jax.training import step
+    from humangs_jax.training.config import tiny
+    from humangs_jax.training.state import init_state
+
+    config, capture = tiny(), hg.load_capture("demo_capture").resized(64)
+    state = init_state(config)
+    body, views = gaussian_body(capture.body, config.model), standardize(capture, 32)
+    batch = jax.tree.map(lambda x: x[None], Example(views, hg.replace(views, depths=views.masks)))
+    avatar: list[hg.Avatar] = []
+    photos = lambda: avatar.append(hg.reconstruct(state.variables, config.model, capture))
+    found = {"walk: photos through reconstruct": walked(photos, hg.Capture, SubjectViews, HumanGSInputs)}
+    gaussians = hg.animate(avatar[0], capture.pose(0))
+    image = lambda: hg.render(gaussians, capture.cameras[0])
+    found["walk: Gaussians through render"] = walked(image, hg.Gaussians)
+    loss = lambda: jax.eval_shape(lambda state: step.train_step(state, batch, body, config), state)
+    traced = jax.jit(step.update, static_argnames=("config", "mesh"))
+    with mock.patch.object(step, "compiled_update", lambda: traced):  # which cannot be traced alone: it has compiler options
+        found["walk: an example to the loss"] = walked(loss, Example, SubjectViews, HumanGSInputs, Drawn)
+    return found

@@ -108,19 +108,18 @@ TELE = 0.42
 
 
 @entry
-def people_sheets(run: Run, out: Path = Path("docs/images"), subjects: int = 64) -> None:
+def people_sheets(run: Run, out: Path = Path("docs/images")) -> None:
     """Contact sheets of synthetic people: front and back, 8 heads and hands, 8 sequences of 8 frames.
 
     All three take a minute of one CPU core. The same command gives the same images bit for bit on the same machine.
 
     Options:
     out: folder to write into
-    subjects: people on the first sheet, of the demo seeds
     """
     body = load_body()
     out.mkdir(parents=True, exist_ok=True)
     makers = {
-        "front_back": (front_back, DEMO[:subjects]),
+        "front_back": (front_back, DEMO[:64]),
         "close": (close_ups, DEMO[200:208]),
         "sequences": (motions, DEMO[300:308]),
     }

@@ -49,7 +49,7 @@ SHOWN = (
 
 
 @entry
-def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20) -> None:
+def page(run: Run, size: int = 512, frames: int = 20) -> None:
     """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with software WebGL.
 
     Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses, screenshots against `hg.render` of
@@ -58,13 +58,12 @@ def page(run: Run, avatar: Path | None = None, size: int = 512, frames: int = 20
     without waiting for the screen, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges).
 
     Options:
-    avatar: an avatar file instead of the shipped person, feed-forward
     size: side of the images in pixels
     frames: images that are timed
     """
     if reason := missing():
         raise ValueError(reason)
-    avatars = {"avatar": Avatar.load(avatar) if avatar else shipped_person(), "finer": shipped_person(FINE_EDGE)}
+    avatars = {"avatar": shipped_person(), "finer": shipped_person(FINE_EDGE)}
     with tempfile.TemporaryDirectory() as folder:
         rows = [_measured(each, Path(folder) / f"{name}.html", size, frames) for name, each in avatars.items()]
     header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]

@@ -1,6 +1,5 @@
-"""How well unseen synthetic people are reconstructed, and what changes that: number of photos, light, masks, choice of photos."""
+"""How well unseen synthetic people are reconstructed, by the number of photos."""
 
-import dataclasses
 import functools
 import itertools
 import os
@@ -9,23 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.changes import grown
 from experiments.harness import Run, entry, figure, means
-from experiments.pictures import cropped, frontal_view, write_triples
 from experiments.results import cells, markdown_table, page_of
-from experiments.subjects import RING, TASKS, HeldOut, People, score_tasks, shipped_digest
+from experiments.subjects import RING, TASKS, People, score_tasks
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.data.masks import masks_at_edges
-from humangs_jax.data.photos import cut_out
 from humangs_jax.evaluation.cases import draw_painted_body, draw_views, painted_body
-from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.learned import SHIPPED as SHIPPED_REFINER
-from humangs_jax.refinement.refine import refine
-
-PHOTOS = 4
-AVATARS, ITERATIONS_ALONE = ("pass", "4 iterations"), RefineConfig(steps=0, seconds=None)
-
-# Numbers of photos ---------------------------------------------------------------------------------------------------
 
 COLUMNS = {  # heading and digits
     "psnr": ("PSNR", 2),
@@ -118,79 +105,3 @@ def plot_views(path: Path, mean: dict[int, Any]) -> None:
                     label = f"{name}: {TASKS[task]}"
                     axis.plot(list(mean)[: len(values)], values, style, ms=4, color=f"C{color}", label=label)
             axis.set(xlabel="photos", ylabel="PSNR, dB", title=title, xticks=list(mean))
-
-
-# Masks ---------------------------------------------------------------------------------------------------------------
-
-ERRORS = (0, -1, 1, -3, 3)
-"""Pixels of 256 that the masks are too large."""
-BOXES, LARGEST, NOISE = 120, 0.3, 0.03
-"""Of a room: how many, their largest side in image heights, standard deviation of the noise on the photo."""
-
-
-@entry
-def masks(run: Run, people: People = People(8), sheet: Path | None = None) -> None:
-    """What masks that are too large or too small cost, as they are and moved to the edges in the photos.
-
-    Four photos of each person in front of a room of 120 boxes of random colors, which a mask that is too large lets through.
-    Masks are dilated or eroded by squares. "Exact": the true masks, and photos that were on white from the start.
-
-    Options:
-    sheet: JPEG of every person: truth, masks as they are, masks that were moved
-    """
-    start, refiner = people.start(), {"refiner": shipped_digest(SHIPPED_REFINER)}
-    mean = means(start.rows(run, functools.partial(_masks_of, start), refiner, again=bool(sheet)))
-    if sheet:
-        write_triples(sheet, run.pictures, 2, ("truth", "masks 3 pixels too large", "moved to the edges"))
-    both = lambda name: [f"{mean[f'{name}, {avatar}'][key]:.2f}" for key in ("psnr", "psnr_fg") for avatar in AVATARS]
-    rows = [["exact", "photos on white", *both("exact")]]
-    for error in ERRORS:
-        rows += [[f"{error:+d}" if error else "0", how, *both(f"{error}, {how}")] for how in ("as they are", "moved")]
-    header = ["masks, pixels of 256", "used", *AVATARS, *(f"foreground PSNR, {avatar}" for avatar in AVATARS)]
-    about = f"Means over {len(start.seeds)} people of the {people.split} seeds, {PHOTOS} photos of {people.size} px; PSNR in dB."
-    run.show(f"{about}\n\n{markdown_table(header, rows, 'llrrrr')}", {"settings": start.settings | refiner, "means": mean})
-
-
-def _masks_of(start, seed):
-    """Scores by masks and avatar of one person; a held-out view, true, and after the iterations without and with moved masks."""
-    subject = start._replace(held_out=HeldOut(start.held_out.views, 0, 0)).subject(seed, [PHOTOS])
-    inputs, held_out = subject.inputs(PHOTOS), subject.held_out
-    view = frontal_view(inputs, held_out, list(range(held_out.view_count)))
-    found, shown = {}, [held_out.images[view]]
-
-    def scored(name, photos):
-        avatar = reconstruct(start.variables, start.config, photos)
-        for label, made in zip(AVATARS, (avatar, refine(avatar, photos, ITERATIONS_ALONE)), strict=True):
-            drawn = draw_views(made, held_out)
-            found[f"{name}, {label}"] = score_tasks(drawn.images, held_out, alpha=drawn.alpha)["novel"]
-        return drawn.images[view]
-
-    assert inputs.masks is not None
-    scored("exact", inputs)
-    photos = in_a_room(inputs.images, inputs.masks, seed)
-    for error in ERRORS:
-        used = [grown(mask, round(error * mask.shape[0] / 256)) for mask in inputs.masks]
-        moved = [mask for mask, _ in masks_at_edges(list(photos), used)]
-        for how, each in (("as they are", used), ("moved", moved)):
-            each = np.stack(each).astype(np.float32)
-            cut = np.stack([cut_out(*pair) for pair in zip(photos, each, strict=True)])
-            image = scored(f"{error}, {how}", dataclasses.replace(inputs, images=cut, masks=each))
-            if error == max(ERRORS):
-                shown.append(image)
-    return found, [cropped(image) for image in shown]
-
-
-def in_a_room(images: np.ndarray, masks: np.ndarray, seed: int) -> np.ndarray:
-    """The photos, which are on white, in front of boxes of random colors; in 8 bits."""
-    photos = []
-    for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
-        rng, (height, width) = np.random.default_rng((seed, i)), mask.shape
-        y, x = np.mgrid[:height, :width] / height
-        room = np.ones((height, width, 3)) * rng.random(3)
-        for _ in range(BOXES):
-            left, top = rng.random(2) * 1.1 - 0.1
-            wide, high = 0.02 + LARGEST * rng.random(2) ** 2
-            room[(x > left) & (x < left + wide) & (y > top) & (y < top + high)] = rng.random(3)
-        room += NOISE * rng.normal(size=room.shape)
-        photos.append(np.round(255 * np.clip(image + (1 - mask[..., None]) * (room - 1), 0, 1)) / 255)
-    return np.stack(photos).astype(np.float32)

@@ -35,16 +35,15 @@ FIRST = 10
 
 
 @entry
-def video(run: Run, image: Path, avatar: Path | None = None) -> None:
-    """A sheet of what the options of `humangs animate` and `humangs render` give: the shipped walk, moved 2.5 metres forward.
+def video(run: Run, image: Path) -> None:
+    """A sheet of what options of `humangs animate` and `humangs render` give: the shipped person and walk, 2.5 m forward.
 
     A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers.
 
     Options:
     image: JPEG to write
-    avatar: an avatar file instead of the shipped person, feed-forward
     """
-    person, motion = Avatar.load(avatar) if avatar else shipped_person(), forward_walk()
+    person, motion = shipped_person(), forward_walk()
     rows = [*(walked(person, motion, follow) for follow in (True, False)), looked_at(person, motion)]
     rows += [posed_before(person), layered(person, motion)]
     sheet = [tile(np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN) for row in rows]

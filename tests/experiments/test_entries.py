@@ -13,7 +13,6 @@ CASES = {
     "fit_keypoints": "--people 1 --frames 1 --no-curves",
     "fit_scans": "--subjects 1 --kinds bare",
     "fit_sequences": "--people 2 --smoothness 0.02 --cases",
-    "masks": PEOPLE,
     "paper_claims": "",
     "people_faults": "--subjects 1 --size 64",
     "refinement": f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg --plot FOLDER/a.png",
