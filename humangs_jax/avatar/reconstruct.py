@@ -83,7 +83,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     views, turned = _views(capture, body, config)
-    if displaces(config) and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
+    known = views.displacement is not None
+    if known and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
         body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
