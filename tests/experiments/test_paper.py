@@ -22,6 +22,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.preprocess.run import Settings, preprocess
+from humangs_jax.losses.loss_networks import installed_lpips
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.conversion import to_release
 from humangs_jax.network.humangs import init_humangs
@@ -183,6 +184,7 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif("alex" not in installed_lpips(), reason="needs humangs_jax[lpips]")
 def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "MOST_ROUNDS", 2)
     out = tmp_path / "runs"
