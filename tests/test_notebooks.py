@@ -239,10 +239,12 @@ def test_people_who_are_cut_are_found(top, left, expected, background=178):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # the kernel's own libraries warn as they please
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs_from_top_to_bottom(path, tmp_path):
+def test_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     import nbformat
     from nbclient import NotebookClient
 
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")  # notebooks run for minutes, and some measure time
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     notebook = nbformat.read(path, as_version=4)
     before = len(images(notebook))
     NotebookClient(notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}).execute()
