@@ -108,6 +108,7 @@ def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
     assert project(skin(smaller, rest), cameras[0]).dimming.max() < 0.99
 
 
+@pytest.mark.slow
 def test_dimmed_splats_are_drawn_as_defined():
     gaussians = skin(with_low_pass(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
     camera = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 48, 48), 48, 48)[0]

@@ -316,6 +316,7 @@ def test_a_bank_is_a_source_of_its_split(bank, example):
     assert jax.tree.structure(made) == jax.tree.structure(example)
 
 
+@pytest.mark.slow
 def test_displaced_bodies_and_fewer_photos(bank, example, monkeypatch):
     moved = np.random.default_rng(0).normal(0, 0.01, (bank.people, 5, 3)).astype(np.float16)
     bank = replace(bank, displacements=jnp.asarray(moved))

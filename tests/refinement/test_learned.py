@@ -102,6 +102,7 @@ def test_every_gaussian_is_in_a_cluster_whatever_their_number(count):
     assert (np.diff(graph.weights, axis=1) <= 0).all()
 
 
+@pytest.mark.slow
 def test_clusters_carry_what_one_end_knows_to_the_other(scene):
     avatar, _, parameters, _ = scene
     values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
@@ -227,7 +228,10 @@ def worse(parameters, *_):
     return replace(parameters, means=parameters.means + 0.3), jnp.zeros((), int)
 
 
-@pytest.mark.parametrize(("update", "steps"), [pytest.param(interrupted, 0, marks=pytest.mark.slow), (worse, 0), (worse, 1)])
+@pytest.mark.parametrize(
+    ("update", "steps"),
+    [pytest.param(interrupted, 0, marks=pytest.mark.slow), (worse, 0), pytest.param(worse, 1, marks=pytest.mark.slow)],
+)
 def test_without_useful_iterations_the_avatar_is_that_of_the_steps_alone(update, steps, scene, body, monkeypatch):
     monkeypatch.setattr(search, "learned_update", update)
     config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)

@@ -75,6 +75,7 @@ def test_the_direction_is_from_the_camera_to_the_mean_in_the_world():
         assert (expected == 0).any() and project(random_gaussians(0), view).added_colors is None
 
 
+@pytest.mark.slow
 def test_a_scene_turned_with_its_camera_looks_the_same():
     with jax.enable_x64(True):
         gaussians, view = with_harmonics(random_gaussians(1), 15), camera()

@@ -78,7 +78,7 @@ def assert_close(ours, expected, tolerance):
     jax.tree_util.tree_map_with_path(check, ours, expected)
 
 
-@pytest.mark.parametrize("functions", [0, 15])
+@pytest.mark.parametrize("functions", [pytest.param(0, marks=pytest.mark.slow), 15])
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**20))
 def test_equals_the_reference_with_all_gradients(seed, functions):
@@ -108,7 +108,7 @@ def test_features_are_drawn_beside_the_colors():
         render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
 
 
-@pytest.mark.parametrize("most", [60, 1])
+@pytest.mark.parametrize("most", [pytest.param(60, marks=pytest.mark.slow), 1])
 def test_an_image_in_bands_is_the_image(most):
     gaussians, view = random_gaussians(3, np.float32), camera(np.float32)
     whole, banded = render(gaussians, view), render_in_bands(gaussians, view, most_pairs=most)
