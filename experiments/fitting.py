@@ -1,8 +1,11 @@
-"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known, detections with errors."""
+"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known, detections with errors; and where a
+detector puts its landmarks.
+"""
 
 import dataclasses
 import functools
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +17,14 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.keypoints.keypoints import KEYPOINT_SETS, MEDIAPIPE_33, mirrored_name
 from humangs_jax.data.motion import load_motion
+from humangs_jax.detection.people import Networks, detect_people
 from humangs_jax.fitting.landmark_fit import fit_landmarks
 from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
 from humangs_jax.fitting.triangulation import triangulate, triangulate_robustly
-from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.subject import make_subject
 from humangs_jax.people.surroundings import cameras_around, spread_azimuths
@@ -296,3 +301,77 @@ def spoiled(model, people, name: str):
 def moved(case, by):
     by = np.asarray(by, np.float32)
     return dataclasses.replace(case, joints=case.joints + by, landmarks=case.landmarks + by)
+
+
+CLEAR, SCALE, ITERATIONS, STEP = 0.5, 0.02, 15, 0.01
+"""Least visibility; scale of the robust weights and step of the derivatives, metres; iterations of reweighting."""
+RIDGE, WRONG = 1e-3, 0.05
+"""Keeps offsets near 0 along directions that no view shows. Median error, a share of the person's height, of views left out."""
+
+
+@entry
+def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
+    """Where a detector puts its landmarks on bodies that are known: the places of `KeypointSet.places`, measured.
+
+    Every landmark is looked for in every view of the captures, whose bodies and cameras are taken for the truth. The offset from
+    the base of its place, in the axes of the bones that carry it, is the one that explains all pixels best (robust least squares
+    over all people; left and right are one landmark and its mirror image). `humangs synth` makes captures.
+
+    Options:
+    captures: capture folders, or folders of them
+    """
+    networks, seen = Networks(), {place.name: [] for place in MEDIAPIPE_33.places}
+    for folder in (file.parent for each in captures for file in sorted(each.glob("**/capture.json"))):
+        for name, row in landmark_rows(networks, folder):
+            seen[name].append(row)
+    places = {}
+    for name, own in seen.items():
+        other = mirrored_name(name)
+        if name in places or other in places:
+            continue
+        mirrored = [(change * [-1, 1, 1], error) for change, error in seen[other]] if name != other else []
+        if own or mirrored:
+            offset, scatter = solved_offset(own + mirrored)
+            places[name] = {
+                "millimetres": np.round(offset, 1).tolist(),
+                "scatter": round(scatter, 1),
+                "count": len(own + mirrored),
+            }
+    rows = [[name, *(f"{x:.0f}" for x in row["millimetres"]), f"{row['scatter']:.0f}"] for name, row in places.items()]
+    header = ["landmark, left or middle", "to the left", "up", "forwards", "scatter, mm"]
+    run.show(markdown_table(header, rows), {"places": places})
+
+
+def landmark_rows(networks, folder):
+    """(name, (change of the image with the offset (2, 3), error (2,))) of a capture's clear landmarks, metres at the person."""
+    capture, kind = load_capture(folder), MEDIAPIPE_33
+    plain = tuple(place._replace(offset=(0.0, 0.0, 0.0)) for place in kind.places)
+    model = landmark_model(capture.body, kind.names, plain)
+    moved = [replace(model, points=replace(model.points, rest=model.points.rest + STEP * row)) for row in jnp.eye(3)]
+    for view in range(capture.view_count):
+        people = detect_people(networks, np.asarray(capture.images[view], np.float32))
+        if not people:
+            continue
+        pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view]
+        betas = jnp.asarray(capture.betas)
+        points = [pose_landmarks(each, betas, pose)[0] for each in (model, *moved)]
+        pixels, depths = (np.asarray(x, float) for x in jax.vmap(functools.partial(project, camera))(jnp.stack(points)))
+        changes = np.moveaxis(pixels[1:] - pixels[0], 0, -1) / STEP
+        errors = people[0].pixels - pixels[0]
+        if np.median(np.linalg.norm(errors, axis=-1)) > WRONG * np.ptp(pixels[0], axis=0).max():
+            continue
+        scale = float(camera.K[0, 0]) / depths[0]
+        for i in np.flatnonzero((people[0].visibility > CLEAR) & np.asarray(model.known, bool)):
+            yield kind.names[i], (changes[i] / scale[i], errors[i] / scale[i])
+
+
+def solved_offset(rows):
+    """The offset that explains the errors best, and the median length of what is left, millimetres."""
+    changes, errors = (np.stack(each) for each in zip(*rows, strict=True))
+    weights, offset = np.ones(len(rows)), np.zeros(3)
+    for _ in range(ITERATIONS):
+        matrix = np.einsum("n,nij,nik->jk", weights, changes, changes) + RIDGE * np.eye(3)
+        offset = np.linalg.solve(matrix, np.einsum("n,nij,ni->j", weights, changes, errors))
+        left = np.linalg.norm(errors - changes @ offset, axis=-1)
+        weights = 1 / (1 + np.square(left / SCALE))
+    return 1000 * offset, 1000 * float(np.median(left))

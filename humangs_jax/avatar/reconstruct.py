@@ -83,8 +83,8 @@ def reconstruct(variables: Variables, config: HumanGSConfig, capture: Capture) -
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     views, turned = _views(capture, body, config)
-    known = views.displacement is not None
-    if known and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
+    displaced = views.displacement is not None
+    if displaced and (worn := with_skirt(body, capture, np.asarray(views.displacement))) is not None:
         body, views = worn[0], replace(views, displacement=jnp.asarray(worn[1]))
     count = len(views.images)
     if (bucket := round_up(count, smallest=1)) > count:
@@ -169,7 +169,7 @@ def reconstruct_many(
 
 
 def _tried(each: Reconstructed, field: str, make: Callable[[], Any], *faults: type[Exception]) -> Reconstructed:
-    """With what is made, or its error: ValueError, or one of other faults of the capture."""
+    """`each` with the result of `make`, or with its error if that is a ValueError or one of `faults`."""
     try:
         return each._replace(**{field: make()})
     except (ValueError, *faults) as error:

@@ -150,11 +150,6 @@ def write_fitted(
         if record is not None:
             write_fit_record(folder / FIT_FILE, record)
 
-    def write_beside(folder: Path):
-        write_fit(folder)
-        if record is None:  # before the cameras change: no record is better than one of other cameras
-            (target / FIT_FILE).unlink(missing_ok=True)
-
     def write(folder: Path):
         folder.mkdir()
         for file in _photo_files(description):
@@ -162,7 +157,7 @@ def write_fitted(
         write_fit(folder)
 
     if target.resolve() == source.resolve():
-        add_files(target, write_beside)
+        add_files(target, write_fit, invalid=() if record is not None else (FIT_FILE,))  # a record of other cameras
     else:
         check_place(source, target, overwrite=True)
         replace_folder(target, write, mark="capture.json")

@@ -209,7 +209,11 @@ def _entries(folder: str | os.PathLike[str]) -> list[str]:
 
 
 def add_files(
-    folder: str | os.PathLike[str], write: Callable[[Path], object], *, without: Iterable[str | os.PathLike[str]] = ()
+    folder: str | os.PathLike[str],
+    write: Callable[[Path], object],
+    *,
+    without: Iterable[str | os.PathLike[str]] = (),
+    invalid: Iterable[str | os.PathLike[str]] = (),
 ) -> None:
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
@@ -217,6 +221,7 @@ def add_files(
     falls between two, and those of two processes do not mix. The folder may be a mount point or the working folder.
 
     Arguments: without: files in the folder that are out of date; those that are not replaced are deleted after the last move.
+    invalid: files that must never lie beside the new ones; they are deleted before the first move.
     Raises: OSError, naming `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
@@ -232,6 +237,8 @@ def add_files(
         with undisturbed():
             folder.mkdir(exist_ok=True)
             with _locked(folder, wait=True):
+                for file in invalid:
+                    (folder / file).unlink(missing_ok=True)
                 new = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
                 for file in new:
                     (folder / file).parent.mkdir(parents=True, exist_ok=True)

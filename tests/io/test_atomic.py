@@ -115,9 +115,11 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
 
 @pytest.mark.parametrize("moves", [0, 1, 2])
 def test_an_interrupt_between_moves_deletes_no_old_file(tmp_path, monkeypatch, moves):
-    """Files that are out of date go last: a process that is killed before leaves the old or the new of each name."""
+    """Files that are out of date go last: a process that is killed before leaves the old or the new of each name. Files that must
+    not lie beside the new ones go first.
+    """
     old, new = ("a.png", "b.png", "c.png"), ("a.png", "b.png")
-    for name in old:
+    for name in (*old, "invalid"):
         (tmp_path / name).write_text("old")
     replace, moved = Path.replace, []
 
@@ -130,7 +132,7 @@ def test_an_interrupt_between_moves_deletes_no_old_file(tmp_path, monkeypatch, m
     monkeypatch.setattr(Path, "replace", interrupted)
     write = lambda folder: [(folder / name).write_text("new") for name in new]
     with pytest.raises(Interrupted) if moves < 2 else contextlib.nullcontext():
-        atomic.add_files(tmp_path, write, without=old)
+        atomic.add_files(tmp_path, write, without=old, invalid=("invalid",))
     texts = {name: (tmp_path / name).read_text() for name in names(tmp_path)}
     expected = {name: "new" if i < moves else "old" for i, name in enumerate(old)}
     assert texts == (expected if moves < 2 else dict.fromkeys(new, "new"))

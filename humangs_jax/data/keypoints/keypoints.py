@@ -124,8 +124,8 @@ HALPE_136 = _keypoint_set(
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
-# millimetres. Measured with BlazePose on 12 synthetic people, the mean; those of hips, wrists, knees, ankles and feet are the
-# mean of these and of a barefoot man's, since synthetic people wear shoes
+# millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of hips, wrists, knees,
+# ankles and feet are the mean of these and of a barefoot man's, since synthetic people wear shoes
 _MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
 _BLAZEPOSE_PLACES = (
     place("nose", "nose", ("head",), (0, 13, -12)),

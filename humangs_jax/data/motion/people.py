@@ -33,7 +33,7 @@ OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
 """Suffixes of files of one person each; others are of one frame each."""
 DEEPEST, SHOWN = 6, 12
 NEARLY_ORTHONORMAL = 0.1
-"""As `ORTHONORMAL`, of matrices that are meant to be rotations, and no people: whether they are is found out later."""
+"""3 x 3 matrices this close to rotations are those of one person, not vectors of three people; `ORTHONORMAL` is checked later."""
 
 
 class Person(NamedTuple):
