@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import json
 import os
 import re
 import subprocess
@@ -21,9 +20,6 @@ LONG = 500
 """Lines from which on a module is long."""
 GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
 """Pages that scripts write."""
-TERMS = "rounds of the learned|on the person(?!')|fog|painted body|yardstick|unseen poses|new views|psnr_mask|psnr_foreground"
-DIALECT = re.compile(rf"\b({TERMS}|colour\w*)\b")
-"""Words that the field does not use."""
 
 
 @entry
@@ -74,12 +70,6 @@ def measure(root: Path) -> dict[str, Any]:
     found["docs: words by hand, without code and generated tables"] = sum(len(text.split()) for text in by_hand.values())
     found["docs: words of README"] = len((root / "README.md").read_text().split())
     found["docs: tables on pages written by hand"] = sum(text.count("| --- ") > 0 for text in by_hand.values())
-    found["docs: terms of another dialect"] = [
-        f"{name}: {term}" for name, text in by_hand.items() for term in sorted(set(DIALECT.findall(text)))
-    ]
-    found["docs: broken links"] = [
-        link for name in known if name.endswith((".md", ".ipynb")) for link in broken_links(root, name)
-    ]
     found |= helps(root)
     found["public functions with arguments, results, errors and an example in the docstring"] = documented(root)
     results = [name for name in known if name.startswith("docs/results/")]
@@ -106,28 +96,6 @@ def written(text: str) -> str:
     """A page without what scripts write into it, and without code."""
     text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
     return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-
-
-def broken_links(root: Path, name: str) -> list[str]:
-    """Links of a page or notebook to files and headings that are not there; addresses are not looked up."""
-    text = (root / name).read_text()
-    if name.endswith(".ipynb"):
-        text = "\n\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown")
-    broken = []
-    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^ *```.*?^ *```|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)):
-        path, _, heading = target.partition("#")
-        file = (root / name).parent / path if path else root / name
-        if "://" in target or target.startswith("mailto:"):
-            continue
-        if not file.exists() or (heading and file.suffix == ".md" and heading not in headings(file.read_text())):
-            broken.append(f"{name}: {target}")
-    return broken
-
-
-def headings(text: str) -> set[str]:
-    """The names by which headings of a page are linked."""
-    titles = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
-    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
 
 
 def helps(root: Path) -> dict[str, Any]:

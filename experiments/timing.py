@@ -5,10 +5,8 @@ several times, and CPU time (caches, clock) by a third: compare ratios of CPU ti
 """
 
 import os
-import resource
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -39,17 +37,3 @@ def medians(runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int
         for name, run in runs.items():
             samples[name].append(timed(run))
     return {name: np.median(np.asarray(sample), axis=0) for name, sample in samples.items()}
-
-
-def peak_rss_mb() -> float:
-    """The most memory that this process has held, MiB.
-
-    Linux hands `ru_maxrss` of the parent down through exec, so the process's own high-water mark is read where there
-    is one.
-    """
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

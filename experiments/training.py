@@ -17,9 +17,9 @@ from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry, figure
 from experiments.reconstruction import foreground, matmul_program, random_variables
 from experiments.results import markdown_table
-from experiments.timing import medians, peak_rss_mb
+from experiments.timing import medians
 from humangs_jax.body.library import load_body
-from humangs_jax.core.processes import compiler_options
+from humangs_jax.core.processes import compiler_options, memory_status
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Example, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs
 from humangs_jax.geometry.camera import Camera
@@ -152,7 +152,7 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
         "share_of_floor": float(floor[0]) / wall,
         "share_of_floor_cpu": float(floor[1]) / max(cpu, 1e-9),
         "temporary_mb": temporary_mb(program),
-        "peak_rss_mb": peak_rss_mb(),
+        "peak_rss_mb": memory_status("VmHWM"),
         "compile_cpu_s": compile_s,
         "tokens": model.runtime.token_capacity if model.tokens == "foreground" else patches,
         "gaussians": len(carrier.template) * model.architecture.decoder.gaussians_per_vertex,

@@ -54,16 +54,16 @@ def peak_memory() -> Generator[list[float | None]]:
     trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5")  # the high-water mark starts anew
-        before = _status("VmRSS")
+        before = memory_status("VmRSS")
     except OSError:
         before = None
     yield result
     if before is not None:
-        result[0] = max(0.0, _status("VmHWM") - before)
+        result[0] = max(0.0, memory_status("VmHWM") - before)
 
 
-def _status(name: str) -> float:
-    """A line of /proc/self/status, MiB."""
+def memory_status(name: str) -> float:
+    """A line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak. Linux alone."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:"))
 
