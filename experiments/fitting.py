@@ -324,20 +324,15 @@ def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
     for folder in (file.parent for each in captures for file in sorted(each.glob("**/capture.json"))):
         for name, row in landmark_rows(networks, folder):
             seen[name].append(row)
-    places = {}
+    places, rows = {}, []
     for name, own in seen.items():
-        other = mirrored_name(name)
-        if name in places or other in places:
+        if (other := mirrored_name(name)) in places:
             continue
         mirrored = [(change * [-1, 1, 1], error) for change, error in seen[other]] if name != other else []
         if own or mirrored:
             offset, scatter = solved_offset(own + mirrored)
-            places[name] = {
-                "millimetres": np.round(offset, 1).tolist(),
-                "scatter": round(scatter, 1),
-                "count": len(own + mirrored),
-            }
-    rows = [[name, *(f"{x:.0f}" for x in row["millimetres"]), f"{row['scatter']:.0f}"] for name, row in places.items()]
+            places[name] = {"millimetres": np.round(offset, 1).tolist(), "scatter": round(scatter, 1)}
+            rows.append([name, *(f"{x:.0f}" for x in offset), f"{scatter:.0f}"])
     header = ["landmark, left or middle", "to the left", "up", "forwards", "scatter, mm"]
     run.show(markdown_table(header, rows), {"places": places})
 
