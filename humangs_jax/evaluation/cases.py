@@ -288,8 +288,7 @@ def predictions_method(folder: str | Path, people: int) -> Method:
         raise FileNotFoundError(f"{root}: no such folder of predictions")
 
     def method(case: Case, background: float) -> Predicted:
-        place = root / case.name if people > 1 or (root / case.name).is_dir() else root
-        files = {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
+        place, files = _predictions_of(case, root, people), prediction_files(root, case, people)
         missing = tuple(str(place / f"{name}.png") for name, file in files.items() if file is None)
         found = [(i, file) for i, file in enumerate(files.values()) if file is not None]
         if not found:
@@ -304,6 +303,16 @@ def predictions_method(folder: str | Path, people: int) -> Method:
         return Predicted(images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing)
 
     return method
+
+
+def _predictions_of(case: Case, root: Path, people: int) -> Path:
+    return root / case.name if people > 1 or (root / case.name).is_dir() else root
+
+
+def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
+    """The image of each view of a case in a folder of predictions; None for those that are not there."""
+    place = _predictions_of(case, root, people)
+    return {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
 
 
 def _prediction(place: Path, name: str, index: int) -> Path | None:

@@ -28,8 +28,8 @@ from humangs_jax.data.body_and_masks import empty_views
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
-from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
 from humangs_jax.evaluation.cases import Case, Indices, Method, Predicted, choose_method, find_people
+from humangs_jax.evaluation.kept import KeptScores, body_key, indices_key, method_key, networks_key
 from humangs_jax.evaluation.scores import (
     CONFIDENCE,
     PROTOCOLS,
@@ -46,7 +46,7 @@ from humangs_jax.evaluation.scores import (
 )
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.images import resized, to_uint8
-from humangs_jax.io.reading import json_text, read_json, write_json
+from humangs_jax.io.reading import json_text
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
@@ -290,7 +290,9 @@ def evaluate(
             otherwise their LPIPS is None, and the reason is reported.
         body: the model that the parameters belong to, or its file.
         page_images: how many images are kept for the HTML page, the worst ones.
-        keep: a folder for the scores of finished people, so that the same call goes on after an interruption.
+        keep: a folder for the scores of finished people, so that the same call goes on after an interruption. Scores are
+            kept with a checksum of photos, cameras, bodies, views and weights, so that those of others are never taken. Of a
+            `method` the name and source are known: name another folder where it reads other values.
         progress: show a bar.
 
     Returns:
@@ -311,22 +313,28 @@ def evaluate(
     choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
     people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
-    kept = None if keep is None else Path(keep)
-    if kept is not None:
-        said = {"name": name, "protocol": repr(rules), "people": len(people.names)}
-        begin_set(kept, SCORES, {SETTINGS: said | {"lpips": sorted(networks), "images": page_images}})
+    kept = None
+    if keep is not None:
+        own_key, key_of = method_key(len(people.names), avatar, weights, predictions, method)
+        said = {
+            "name": name,
+            "method": own_key,
+            "source": _told(source),
+            "protocol": repr(rules),
+            "inputs": inputs,
+            "indices": indices_key(choice),
+            "body": body_key(body),
+            "lpips": networks_key(networks),
+            "images": page_images,
+        }
+        kept = KeptScores(Path(keep), said, key_of, ordered=page_images > 0)
     rows, missing, scored, gallery = [], [], [], Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
-        file = None if kept is None else kept / f"person_{index}.json"
-        if file is not None and file.is_file():
-            person = read_json(file)
-            for i, shot in person["shots"]:
-                gallery.add(len(rows) + i, person["rows"][i][-1]["psnr"], functools.partial(dict, shot))
-        else:
-            person = _score_person(people.load(index), predict, rules, networks, gallery, len(rows))
-            if file is not None:
-                file.parent.mkdir(exist_ok=True)  # gone, where the same call in another process has ended
-                write_json(file, person)
+        case = people.load(index)
+        score = functools.partial(_score_person, case, predict, rules, networks, gallery, len(rows))
+        person, was_kept = (score(), False) if kept is None else kept(case, score)
+        for i, shot in person["shots"] if was_kept else ():
+            gallery.add(len(rows) + i, person["rows"][i][-1]["psnr"], functools.partial(dict, shot))
         missing += person["missing"]
         if person["rows"]:
             rows += [Scored(*row) for row in person["rows"]]
@@ -336,7 +344,7 @@ def evaluate(
         raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
     people_shown = {row.person for row in rows}
     about = {
-        "source": printable(source) if isinstance(source, str | Path) else type(source).__name__,
+        "source": printable(_told(source)),
         "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
         "sides": sorted({tuple(person["side"]) for person in scored}),
         "inputs": sorted({person["inputs"] for person in scored} - {None}),
@@ -348,6 +356,11 @@ def evaluate(
     reasons |= {score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons}
     label = protocol if isinstance(protocol, str) else "custom"
     return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+
+
+def _told(source: Any) -> str:
+    """A path as it was given; of another source its kind."""
+    return str(source) if isinstance(source, str | Path) else type(source).__name__
 
 
 def _score_person(

@@ -1,5 +1,6 @@
 """The evaluator from source to report: which views are compared, predictions by file name, and what is wrong in one line."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -20,6 +21,7 @@ from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.evaluation import run as evaluation
 from humangs_jax.evaluation.cases import Case, Predicted, _short_names, find_people, spread_views
+from humangs_jax.evaluation.kept import method_key
 from humangs_jax.io.images import write_png
 
 NAMES = ("front", "left", "back", "right")
@@ -113,6 +115,54 @@ def test_people_who_are_scored_are_kept(people, tmp_path):
     assert found.gallery.shots == plain.gallery.shots and found.gallery.inputs == plain.gallery.inputs
     with pytest.raises(ValueError, match=r"written with settings other than asked for now \(images 5 -> 6\)"):
         run(page_images=6)
+
+
+def white(case, background):
+    return Predicted(np.ones_like(case.truth.images), None, tuple(range(case.truth.view_count)))
+
+
+def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(people, tmp_path):
+    (ann, _), (bob, _) = people["ann"], people["bob"]
+    brighter = dataclasses.replace(ann, images=np.clip(ann.images + 0.1, 0, 1))
+    renamed = Case("ann", bob)
+    run = lambda *cases, **options: hg.evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
+    plain = lambda *cases: hg.evaluate(cases, method=white, page_images=0).rows
+    first = Case("ann", ann)
+    assert run(first) == plain(first)
+    for other in (Case("ann", brighter), renamed, Case("ann", ann.select([0, 2])), Case("eve", ann)):
+        assert run(other) == plain(other) != plain(first)
+        assert run(other, first) == plain(other, first)
+
+
+def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(people, folders, tmp_path):
+    run = lambda **options: hg.evaluate(folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options})
+    views = {name: {"context": [0], "target": [1]} for name in people}
+    run(inputs=1)
+    said = "written with settings other than asked for now "
+    with pytest.raises(ValueError, match=said + r"\(inputs 1 -> 2\)"):
+        run(inputs=2)
+    with pytest.raises(ValueError, match=said + r"\(indices None -> '\w+', inputs 1 -> None\)"):
+        run(indices=views)
+    with pytest.raises(ValueError, match=said + r"\(body None -> '\w+'\)"):
+        run(inputs=1, body=small_body())
+    with pytest.raises(ValueError, match=said + r"\(method .*, name .*\)"):
+        run(inputs=1, method=predicting(people))
+
+
+def test_scores_of_images_that_were_drawn_again_are_not_kept(people, folders, tmp_path):
+    theirs = tmp_path / "theirs"
+    write_predictions(theirs, people)
+    run = lambda: [row.scores["psnr"] for row in hg.evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows]
+    before = run()
+    write_png(theirs / "bob" / "left.png", np.zeros((40, 32, 3)))
+    after = run()
+    assert [old == new for old, new in zip(before, after, strict=True)] == [True] * 5 + [False] + [True] * 2
+
+
+def test_weights_of_other_values_have_another_key():
+    config = hg.reconstruct  # any object that prints
+    keys = [method_key(1, None, ({"params": {"a": np.full(2, x)}}, config), None, None)[0] for x in (1.0, 1.0, 2.0)]
+    assert keys[0] == keys[1] != keys[2]
 
 
 def write_predictions(folder, people, alpha=False):
@@ -331,13 +381,13 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
     monkeypatch.setattr(evaluation, "score_views", score_views)
     run = lambda *more: cli.execute(["evaluate", str(folders), "--predictions", str(tmp_path / "theirs"), *more])
     kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
-    assert run() == cli.INTERRUPTED and kept() == ["person_0.json"]
+    assert run() == cli.INTERRUPTED and [name[:11] for name in kept()] == ["person_ann_"]
     interrupting.clear()
     assert run("--csv", str(tmp_path / "a.csv")) == 0 and len(scored) == 2 and kept() == []
     assert "going on: 1 person is scored" in capsys.readouterr().out
     interrupting.append(True)
     scored.clear()
-    assert run() == cli.INTERRUPTED and kept() == ["person_0.json"]
+    assert run() == cli.INTERRUPTED and [name[:11] for name in kept()] == ["person_ann_"]
     os.utime(max(folders.rglob("*.png"), key=lambda file: len(file.parts)), (0, 0))  # deep in there
     interrupting.clear()
     assert run() == 0 and len(scored) == 3 and "going on" not in capsys.readouterr().out

@@ -1,0 +1,153 @@
+"""Scores of people who are finished, in a folder, so that an interrupted evaluation goes on.
+
+folder/manifest.json           what all of it is made with, see `data.sets`
+folder/person_NAME_KEY.json    the scores of one person; KEY: a checksum of all that they depend on
+
+The key of a person holds contents, not names: photos, masks, cameras, poses and body, and the weights, avatar or images that
+are compared. Scores of other contents are never taken for those that are asked for.
+"""
+
+import hashlib
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from humangs_jax import __version__
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
+from humangs_jax.evaluation.cases import Case, Method, prediction_files, shipped_weights
+from humangs_jax.io.arrays import checksum
+from humangs_jax.io.reading import read_json, write_json
+
+SHORT = 16
+"""Hexadecimal digits of a key that names a file or stands in a manifest: 64 bits."""
+LONGEST_NAME = 40
+"""Characters of a person's name in the name of a file: for readers, the key tells people apart."""
+
+CaseKey = Callable[[Case], str]
+"""What a prediction of a case depends on besides the case."""
+
+
+class KeptScores:
+    """The scores in a folder. ordered: those of a person also depend on who comes before, as the images of a page do.
+
+    Raises: CaptureError for a folder of scores that were made with other settings.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], method: CaseKey, ordered: bool) -> None:
+        begin_set(folder, SCORES, {SETTINGS: {"version": __version__, **settings}})
+        self._folder, self._method, self._ordered = folder, method, ordered
+        self._before = checksum({}, repr(sorted(settings.items())))
+
+    def __call__(self, case: Case, score: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+        """What there is to say of a person, and whether it was kept; `score` is called where it was not."""
+        key = checksum({}, self._before, case_key(case), self._method(case))
+        if self._ordered:
+            self._before = key
+        name = re.sub(r"[^\w.-]+", "-", case.name)[:LONGEST_NAME]
+        file = self._folder / f"person_{name}_{key[:SHORT]}.json"
+        if file.is_file():
+            return read_json(file), True
+        person = score()
+        file.parent.mkdir(exist_ok=True)  # gone, where the same call in another process has ended
+        write_json(file, person)
+        return person, False
+
+
+def tree_key(tree: Any) -> str:
+    """A checksum of the arrays of a pytree, and of its structure."""
+    leaves, structure = jax.tree.flatten(tree)
+    return checksum({str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}, str(structure))
+
+
+def file_key(file: Path) -> str:
+    """A checksum of the bytes of a file; of one that is not there, that it is not."""
+    if not file.is_file():
+        return "none"
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def case_key(case: Case) -> str:
+    """A checksum of the name of a case and of all that is in its captures."""
+    inputs = "none" if case.inputs is None else _capture_key(case.inputs)
+    return checksum({}, case.name, _capture_key(case.truth), inputs)
+
+
+def _capture_key(capture: Capture) -> str:
+    arrays = {"images": capture.images, "masks": capture.masks, "frames": capture.frames, "betas": capture.betas}
+    moved = {"displacement": capture.displacement}
+    known = {name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None}
+    placed = tree_key((capture.cameras, capture.poses))
+    return checksum(known, placed, tree_key(capture.body), repr(capture.names))
+
+
+def indices_key(indices: Mapping[str, Any] | None) -> str | None:
+    """A short checksum of which views are inputs and targets; None without."""
+    if indices is None:
+        return None
+    plain = {name: {key: [int(view) for view in views] for key, views in each.items()} for name, each in indices.items()}
+    return checksum({}, json.dumps(plain, sort_keys=True))[:SHORT]
+
+
+def body_key(body: BodyModel | str | Path | None) -> str | None:
+    """A short checksum of a body that was given; None for the shipped one."""
+    if body is None:
+        return None
+    return (tree_key(body) if isinstance(body, BodyModel) else file_key(Path(body)))[:SHORT]
+
+
+def networks_key(networks: Mapping[str, Any]) -> list[str]:
+    """Names and short checksums of loss networks, in order."""
+    return [f"{name} {tree_key(network)[:SHORT]}" for name, network in sorted(networks.items())]
+
+
+def method_key(
+    people: int,
+    avatar: str | Path | Avatar | None,
+    weights: Any,
+    predictions: str | Path | None,
+    method: Method | None,
+) -> tuple[str, CaseKey]:
+    """What the predictions of all people depend on, as a short text, and what those of one depend on; see `choose_method`.
+
+    A `method` is known by its name and source alone: not by the values of variables that it reads.
+    """
+    nothing: CaseKey = lambda case: ""
+    if method is not None:
+        return _source_key(method)[:SHORT], nothing
+    if predictions is not None:
+        root = Path(predictions)
+        return "images", lambda case: _files_key(file for file in prediction_files(root, case, people).values() if file)
+    if isinstance(avatar, Avatar):
+        return tree_key(avatar)[:SHORT], nothing
+    if avatar is not None:
+        place = Path(avatar)
+        if place.is_dir():
+            return "avatars", lambda case: file_key(place / f"{case.name}.npz")
+        return file_key(place)[:SHORT], nothing
+    if isinstance(weights, str | Path):
+        return file_key(Path(weights))[:SHORT], nothing
+    variables, config = shipped_weights() if weights is None else weights
+    return checksum({}, tree_key(variables), repr(config))[:SHORT], nothing
+
+
+def _files_key(files: Iterable[Path]) -> str:
+    return checksum({}, *(f"{file.name} {file_key(file)}" for file in files))
+
+
+def _source_key(method: Method) -> str:
+    name = f"{getattr(method, '__module__', '')}.{getattr(method, '__qualname__', type(method).__qualname__)}"
+    try:
+        source = inspect.getsource(method)
+    except (OSError, TypeError):  # written in a prompt, or an object that is called
+        source = ""
+    return checksum({}, name, source)
