@@ -123,6 +123,8 @@ class Reconstruct:
         out = self.out or Path("avatars" if several else "avatar.npz")
         if several and out.suffix == ".npz":
             raise UsageError(f"--out {out}: expected a folder for the avatars of several captures")
+        if parts > 1 and not several:
+            raise UsageError(f"--shard {self.shard}: expected several captures, or a folder of them")
         require_place(out, "--out", Place() if several else AVATAR)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct_many
@@ -163,7 +165,8 @@ class Reconstruct:
                 if how is not None and photos.masks is None:
                     tell(f"{name}: no masks: the avatar is not refined")
                 file = out / f"{name}.npz" if several else out
-                _refine_and_save(avatar, photos, file, how if photos.masks is not None else None)
+                # in a set a file is a finished avatar: one that was interrupted is made again
+                _refine_and_save(avatar, photos, file, how if photos.masks is not None else None, unfinished=not several)
         if not several:
             suggest("humangs view", out)
         if failed:
@@ -172,10 +175,14 @@ class Reconstruct:
     def _begin_set(self, out: Path) -> None:
         """Avatars that were made in other ways are not mixed. Raises: CaptureError."""
         from humangs_jax.data.sets import AVATARS, SETTINGS, begin_set
+        from humangs_jax.io.arrays import SHORT, file_checksum
 
         apart = ("captures", "out", "batch", "shard", "check")
-        said = {name: value for name, value in vars(self).items() if name not in apart}
-        begin_set(out, AVATARS, {SETTINGS: {name: str(value) for name, value in said.items()}})
+        said = {name: str(value) for name, value in vars(self).items() if name not in apart}
+        for name in ("weights", "config"):  # other contents under the same name are other settings
+            if (file := getattr(self, name)) is not None and file.is_file():
+                said[name] += f" ({file_checksum(file)[:SHORT]})"
+        begin_set(out, AVATARS, {SETTINGS: said})
 
     def _photos(self, folder: Path, views: int | str | None) -> "Capture":
         """The views of a capture that are used. Raises: ValueError; UsageError for --refine without masks."""
@@ -275,9 +282,17 @@ def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     return photos
 
 
-def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig | None", live: bool = False) -> None:
+def _refine_and_save(
+    avatar: "Avatar",
+    photos: "Capture",
+    out: Path,
+    how: "RefineConfig | None",
+    live: bool = False,
+    unfinished: bool = True,
+) -> None:
     """Refine with a progress bar if asked, write the result (now and then, if live), say what it took.
 
+    unfinished: whether an avatar is written whose refinement was interrupted.
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     if how is None:
@@ -288,6 +303,9 @@ def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "Refin
 
         watch = (lambda so_far: so_far.save(out)) if live else None
         refinement = refine_with_report(avatar, photos, how, progress=True, watch=watch)
+    if refinement.interrupted and not unfinished:
+        tell(f"{out}: not written, its refinement was interrupted: the same command makes it again")
+        raise KeyboardInterrupt
     _save(refinement.avatar, out, f"from {photos.view_count} photos, {refinement.summary()}")
     if refinement.interrupted:
         raise KeyboardInterrupt

@@ -7,7 +7,6 @@ The key of a person holds contents, not names: photos, masks, cameras, poses and
 are compared. Scores of other contents are never taken for those that are asked for.
 """
 
-import hashlib
 import inspect
 import json
 import re
@@ -24,11 +23,9 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.sets import SCORES, SETTINGS, begin_set
 from humangs_jax.evaluation.cases import Case, Method, prediction_files, shipped_weights
-from humangs_jax.io.arrays import checksum
+from humangs_jax.io.arrays import SHORT, checksum, file_checksum
 from humangs_jax.io.reading import read_json, write_json
 
-SHORT = 16
-"""Hexadecimal digits of a key that names a file or stands in a manifest: 64 bits."""
 LONGEST_NAME = 40
 """Characters of a person's name in the name of a file: for readers, the key tells people apart."""
 
@@ -70,10 +67,7 @@ def tree_key(tree: Any) -> str:
 
 def file_key(file: Path) -> str:
     """A checksum of the bytes of a file; of one that is not there, that it is not."""
-    if not file.is_file():
-        return "none"
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
+    return file_checksum(file) if file.is_file() else "none"
 
 
 def case_key(case: Case) -> str:

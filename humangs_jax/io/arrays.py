@@ -21,6 +21,9 @@ from humangs_jax.io.atomic import replace_file
 from humangs_jax.io.reading import FileError, Refused, check_limit, check_unpacked, open_file, reading
 from humangs_jax.io.restricted_pickle import as_array, plain_array, read_pickle
 
+SHORT = 16
+"""Hexadecimal digits of a checksum that names a file or stands in a manifest: 64 bits."""
+
 
 def numbers(
     value: Any,
@@ -138,6 +141,12 @@ def checksum(arrays: Mapping[str, Any], *texts: str) -> str:
     for text in texts:
         digest.update(f"{len(text)} {text}\n".encode())
     return digest.hexdigest()
+
+
+def file_checksum(file: Path) -> str:
+    """SHA-256, in hexadecimal, of the bytes of a file. Raises: OSError."""
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def check_checksum(recorded: Any, found: str) -> None:

@@ -1,5 +1,6 @@
 import dataclasses
 import shutil
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -92,6 +93,38 @@ def test_a_folder_of_captures_goes_on_after_failures_and_interruptions(people, t
     assert code == cli.BAD_DATA and "views 'None' -> '2'" in err
 
 
+def test_an_avatar_of_a_set_whose_refinement_is_interrupted_is_made_again(people, tmp_path, monkeypatch, capsys):
+    shutil.copy("people/a/body.npz", "people/b/body.npz")
+    stopped = ["b"]
+
+    def refined(avatar, photos, how, **_):
+        interrupted = people[-1:] == stopped
+        summary = lambda: "refined"
+        return SimpleNamespace(avatar=avatar, interrupted=interrupted, summary=summary)
+
+    monkeypatch.setattr("humangs_jax.refinement.refine.refine_with_report", refined)
+    line = ["reconstruct", "people", "--refine", "500steps", "--no-check", "--out", "avatars"]
+    assert cli.execute(line) == cli.INTERRUPTED
+    assert "b.npz: not written, its refinement was interrupted" in capsys.readouterr().out
+    assert [file.name for file in (tmp_path / "avatars").glob("*.npz")] == ["a.npz"]
+    people.clear()
+    stopped.clear()
+    assert cli.execute(line) == 0 and people == ["b", "c", "d"]
+    stopped.append("a")
+    assert cli.execute(["reconstruct", "people/a", *line[2:-1], "a.npz"]) == cli.INTERRUPTED
+    assert (tmp_path / "a.npz").is_file()  # of one avatar what there is so far is written
+
+
+def test_a_set_of_avatars_made_with_other_weights_of_that_name_is_refused(people, tmp_path, monkeypatch, humangs):
+    monkeypatch.setattr("humangs_jax.network.weights.load_weights", lambda path: ({}, presets.tiny()))
+    (tmp_path / "w.safetensors").write_bytes(b"one")
+    line = ("reconstruct", "people", "--refine", "0", "--no-check", "--weights", "w.safetensors")
+    humangs(*line)
+    (tmp_path / "w.safetensors").write_bytes(b"another")
+    code, _, err = humangs(*line)
+    assert code == cli.BAD_DATA and "written with settings other than asked for now (weights 'w.safetensors (" in err
+
+
 def test_shards_are_all_captures_once(people, humangs):
     for shard in ("0/3", "1/3", "2/3"):
         humangs("reconstruct", "people", "--refine", "0", "--no-check", "--out", "avatars", "--shard", shard)
@@ -105,6 +138,7 @@ def test_shards_are_all_captures_once(people, humangs):
         ("reconstruct people/a people/b/../a", "people/b/../a and people/a: expected captures of different names"),
         ("reconstruct", "CAPTURES: expected at least one folder"),
         ("reconstruct people --shard 3/3", "--shard 3/3: expected I/N"),
+        ("reconstruct people/a --shard 3/8", "--shard 3/8: expected several captures, or a folder of them"),
         ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
     ],
 )

@@ -60,7 +60,7 @@ from humangs_jax.data.preprocess.protocol import (
     video_alignment,
 )
 from humangs_jax.data.sets import DATA_SET, begin_set, finished, made, write_manifest
-from humangs_jax.io.arrays import write_npz
+from humangs_jax.io.arrays import SHORT, file_checksum, write_npz
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import write_json
@@ -137,7 +137,8 @@ def preprocess(
         raise ValueError(f"{out}: lies in the data set {source}: expected another place")
     names, absent = _subjects(source, settings)
     body = FileBody.load(body_file)
-    begin_set(out, DATA_SET, _made_with(settings), alone=True)
+    made_with = _made_with(source, body, settings)
+    begin_set(out, DATA_SET, made_with, alone=True)
     for name, reason in absent.items():
         _skip(out, name, reason)
     due = {name: path for name, path in list(names.items())[index::count] if not (out / name / settings.mark).is_file()}
@@ -154,7 +155,7 @@ def preprocess(
                 else:
                     _skip(out, name, str(error) or type(error).__name__)
     finally:
-        manifest = _write_lists(out, [*names, *absent], settings)
+        manifest = _write_lists(out, [*names, *absent], settings, made_with)
     counts = manifest["counts"]
     if due and not counts["scenes"]:
         reason = next(iter(manifest["skipped"].values()), "nothing was made")
@@ -177,8 +178,11 @@ def _subjects(source: Path, settings: Settings) -> tuple[dict[str, Path], dict[s
 # Lists and manifest -----------------------------------------------------------------------------------------------------
 
 
-def _made_with(settings: Settings) -> dict[str, Any]:
-    return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)}}
+def _made_with(source: Path, body: FileBody, settings: Settings) -> dict[str, Any]:
+    """What the scenes depend on. The data set by the name of its folder: it may lie elsewhere on another machine."""
+    shipped = body.file == DEFAULT_BODY
+    known = {"source": source.name, "body": body.file if shipped else file_checksum(Path(body.file))[:SHORT]}
+    return {"settings": dataclasses.asdict(settings) | {"factors": list(settings.factors)} | known}
 
 
 def _skip(out: Path, name: str, reason: str) -> None:
@@ -201,7 +205,7 @@ def _read_scene(file: Path, settings: Settings) -> dict[str, Any]:
     return content
 
 
-def _write_lists(out: Path, names: Sequence[str], settings: Settings) -> dict[str, Any]:
+def _write_lists(out: Path, names: Sequence[str], settings: Settings, made_with: dict[str, Any]) -> dict[str, Any]:
     """Lists and manifest of what is there."""
     scenes = {name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)}
     skipped = {
@@ -227,7 +231,7 @@ def _write_lists(out: Path, names: Sequence[str], settings: Settings) -> dict[st
         "unreadable_photos": sum(len(each.get("unreadable", ())) for each in known.values()),
         "missing_photos": sum(sum(each.get("missing", {}).values()) for each in known.values()),
     }
-    return write_manifest(out, DATA_SET, _made_with(settings), counts=counts, split=split, scenes=known, skipped=skipped)
+    return write_manifest(out, DATA_SET, made_with, counts=counts, split=split, scenes=known, skipped=skipped)
 
 
 # One scene ------------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import importlib
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,15 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
     assert (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns == kept
     with pytest.raises(ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"):
         run(videos, out, body, Settings("avatarrex", "scenes", 32, every=1))
+    other = tmp_path / "other.npz"
+    other.write_bytes(Path(body.file).read_bytes())
+    assert preprocess(videos, out, other, settings(), progress=False).made == 0
+    with zipfile.ZipFile(other, "a") as archive:
+        archive.comment = b"another model"
+    with pytest.raises(ValueError, match=r"manifest.json: settings: .*\(body '\w+' -> '\w+'\)"):
+        preprocess(videos, out, other, settings(), progress=False)
+    with pytest.raises(ValueError, match=r"manifest.json: settings: .*\(source '\w+' -> 'avatarrex_a'\)"):
+        run(videos / "avatarrex_a", out, body, settings())
     (out / "avatarrex_a" / "scene.json").write_text('{"known": {"views": true}}')
     with pytest.raises(ValueError, match=r"avatarrex_a/scene.json: known.views: expected an integer, got True"):
         run(videos, out, body, settings())
