@@ -1,12 +1,15 @@
 """humangs_jax: animatable 3D Gaussian humans from a few photos, in functional JAX.
 
 The public interface is the list in `__init__.pyi`, which editors and type checkers read. Each name is imported when it is first
-used, so that `import humangs_jax` and `humangs --help` cost nothing.
+used, so that `import humangs_jax` and `humangs --help` cost nothing. The import itself sets one flag of XLA where the installed
+version of JAX would compute wrong numbers without it.
 """
 
 import ast
 import importlib
 from pathlib import Path
+
+from humangs_jax.core.jax_faults import avoid_wrong_sums
 
 __version__ = "0.1.0"
 
@@ -18,6 +21,8 @@ _PUBLIC = {
 }
 
 __all__ = ["__version__", *_PUBLIC]
+
+avoid_wrong_sums()
 
 
 def __getattr__(name: str) -> object:
