@@ -284,9 +284,23 @@ def _paint(mesh: Any) -> None:
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.broadcast_to(colors, (count, np.shape(colors)[-1])))
 
 
+HARMLESS_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_mesh_quantization", "KHR_texture_transform", "KHR_xmp")
+"""Beginnings of names of glTF extensions that leave positions and faces where the file has them."""
+
+
+def _check_extensions(content: dict[str, Any]) -> None:
+    """glTF 2.0 asks readers to refuse a file that requires an extension which they do not know."""
+    for name in content.get("extensionsRequired", []):
+        if "draco" in name or "meshopt" in name:
+            raise Refused(f"compressed by {shown(name)}: expected a GLB without compression")
+        if not name.startswith(HARMLESS_EXTENSIONS):
+            raise Refused(f"requires the extension {shown(name)}: expected a plain glTF 2.0 mesh")
+
+
 def _check_glb(data: bytes, textures: bool) -> None:
     """Raises: Refused, KeyError, TypeError, ... for sizes and places that do not fit the file."""
     content, binary = parse_glb(data)
+    _check_extensions(content)
     views = [view_of(view, binary) for view in content.get("bufferViews", [])]
     counts = [count_of(accessor) for accessor in content.get("accessors", [])]
     corners = lambda part: counts[part["attributes"]["POSITION"]] + (3 * counts[part["indices"]] if "indices" in part else 0)

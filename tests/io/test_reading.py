@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import json
 import re
 import struct
 import threading
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from humangs_jax.io import reading as module
@@ -234,3 +236,34 @@ def test_textures_outside_of_the_folder_of_a_mesh_are_left_out(tmp_path, caplog)
         (mesh,) = read_meshes(folder / "scan.obj", colors=True)
         assert (mesh.visual.vertex_colors == color).all()
     assert "'../red.png' lies outside of" in caplog.text
+
+
+def glb_that_requires(path, *extensions):
+    """A box as GLB whose header requires glTF extensions."""
+    data = trimesh.creation.box().export(file_type="glb")
+    size = struct.unpack("<I", data[12:16])[0]
+    content = json.loads(data[20 : 20 + size]) | {"extensionsRequired": list(extensions)}
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :]
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    return path
+
+
+@pytest.mark.parametrize(
+    "extension, words",
+    [
+        ("KHR_draco_mesh_compression", "compressed by 'KHR_draco_mesh_compression': expected a GLB without compression"),
+        ("EXT_meshopt_compression", "compressed by 'EXT_meshopt_compression'"),
+        ("ACME_voxels", "requires the extension 'ACME_voxels': expected a plain glTF"),
+    ],
+)
+def test_a_glb_that_requires_an_unknown_extension_is_refused_by_its_name(tmp_path, extension, words):
+    path = glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit", extension)
+    with pytest.raises(FileError, match=words):
+        read_meshes(path)
+
+
+def test_a_glb_whose_extensions_leave_the_shape_alone_is_read(tmp_path):
+    (mesh,) = read_meshes(glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit"))
+    assert len(mesh.faces) == 12
