@@ -14,6 +14,7 @@ import importlib.metadata
 import os
 import platform
 import signal
+import zlib
 from pathlib import Path
 
 # before JAX is imported; the programs that tests start inherit it
@@ -84,6 +85,22 @@ jax.config.update(
 
 for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isclose")):
     setattr(owner, name, scaled_comparison(getattr(owner, name)))
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slice", metavar="I/N", help="run only the I-th (from 0) of N slices of the tests")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Keeps one slice of the tests. A test's slice hangs on its name alone, so that N runs see all."""
+    wish = config.getoption("--slice")
+    if wish is None:
+        return
+    wanted, count = map(int, wish.split("/"))
+    slices = [zlib.crc32(item.nodeid.encode()) % count for item in items]
+    dropped = [item for item, own in zip(items, slices, strict=True) if own != wanted]
+    items[:] = [item for item, own in zip(items, slices, strict=True) if own == wanted]
+    config.hook.pytest_deselected(items=dropped)
 
 
 @pytest.fixture(scope="session", autouse=True)
