@@ -32,7 +32,7 @@ ALPHA_MIN = 1 / 255
 """A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
 
 ALPHA_MAX = 0.999
-"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat 0.999; INRIA 0.99."""
+"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat and INRIA have 0.99."""
 
 TRANSMITTANCE_STOP = 1e-4
 """A pixel ends before the splat that would leave a transmittance T <= this. The same everywhere."""
