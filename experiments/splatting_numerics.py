@@ -17,6 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
@@ -240,14 +241,14 @@ def coincident(reverse: bool = False) -> Scene:
     return dataclasses.replace(scene, gaussians=jax.tree.map(lambda a: a[order], scene.gaussians))
 
 
-def narrow(dtype: type, *others: str) -> Scene:
+def narrow(dtype: DTypeLike, *others: str) -> Scene:
     """Gaussians, and other arrays of the scene, in another dtype."""
     scene = ordinary()
     cast = lambda name: jax.tree.map(lambda a: np.asarray(a, dtype), getattr(scene, name))
     return dataclasses.replace(scene, **{name: cast(name) for name in ("gaussians", *others)})
 
 
-def narrow_everything(dtype: type) -> Scene:
+def narrow_everything(dtype: DTypeLike) -> Scene:
     return narrow(dtype, "K", "pose", "background")
 
 
