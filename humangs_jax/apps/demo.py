@@ -16,7 +16,7 @@ import numpy as np
 from humangs_jax.apps.settings import Settings
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.splats import write_ply
+from humangs_jax.avatar.export.gaussians import export
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
@@ -114,8 +114,9 @@ def _write_demo(
             avatar, refined = run.avatar, _images(held_out(run.avatar))
         rows = np.clip(np.stack([truth.images, ours, refined], axis=1).reshape(-1, *ours.shape[1:]), 0, 1)
         contact_sheet(rows, folder / "refined.png", headers=("truth", "feed-forward", "refined") * 2, columns=6)
-        about = {"steps": run.steps, "seconds": round(run.seconds, 1), "compile_seconds": round(run.compile_seconds, 1)}
-        report["refined"] = _scores(refined, truth) | about
+        counts = {name: getattr(run, name) for name in ("iterations", "steps", "head_steps")}
+        times = {name: round(getattr(run, name), 1) for name in ("seconds", "compile_seconds")}
+        report["refined"] = _scores(refined, truth) | counts | times
     with stage("animating"):
         shot = settings.shot(Shot(size=frame_size, azimuth=25.0))
         draw = lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))
@@ -124,7 +125,7 @@ def _write_demo(
             write_video(folder / name, frames, motion.fps)
     with stage("writing"):
         avatar.save(folder / "avatar.npz")
-        write_ply(folder / "avatar.ply", avatar.gaussians)
+        export(folder / "avatar.ply", avatar)  # in the world of its viewers, as `humangs export` writes it
         write_page(folder / "avatar.html", avatar, motion)
         write_renderings_exr(folder / "novel_views.exr", *held_out(avatar, background=0.0))
     report["total_seconds"] = round(time.perf_counter() - began, 3)

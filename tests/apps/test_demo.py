@@ -7,6 +7,8 @@ import pytest
 from exr_files import camera_of, read_exr
 
 from humangs_jax.apps.demo import run_demo
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.export.gaussians import export, load_gaussians
 from humangs_jax.refinement.config import RefineConfig
 
 PRODUCTS = {
@@ -49,6 +51,21 @@ def test_the_report_holds_what_is_promised(out):
     assert {"reconstruct", "animate", "render_held_out"} <= set(report["timings"])
     assert {"compile", "run"} == set(report["timings"]["reconstruct"])
     assert {"jax", "flax", "humangs_jax", "python"} <= set(report["versions"]) and report["device"]
+
+
+@pytest.mark.slow
+def test_the_gaussians_of_the_demo_are_those_of_export(out, tmp_path):
+    export(tmp_path / "avatar.ply", Avatar.load(out / "avatar.npz"))
+    assert (out / "avatar.ply").read_bytes() == (tmp_path / "avatar.ply").read_bytes()
+    heights = -np.asarray(load_gaussians(out / "avatar.ply").means)[:, 1]  # the file has y down
+    assert abs(np.quantile(heights, 0.001)) < 0.05 and 1.4 < heights.max() < 2.2
+
+
+@pytest.mark.slow
+def test_the_report_counts_all_kinds_of_steps(out):
+    refined = json.loads((out / "report.json").read_text())["refined"]
+    assert {"iterations", "steps", "head_steps", "seconds", "compile_seconds"} <= set(refined)
+    assert refined["steps"] == 12
 
 
 @pytest.mark.slow
