@@ -156,6 +156,12 @@ class Avatar(Batchable):
     Examples:
         >>> avatar = hg.Avatar.load("avatar.npz")
         >>> image = hg.render(hg.animate(avatar, pose), camera).rgb
+
+        `faces` are integers, which `jax.grad` refuses. Differentiate a part of an avatar, or all but the integers:
+
+        >>> gradient = jax.grad(lambda part: loss(hg.replace(avatar, gaussians=part)))(avatar.gaussians)
+        >>> floats, rest = equinox.partition(avatar, equinox.is_inexact_array)
+        >>> gradient = jax.grad(lambda floats: loss(equinox.combine(floats, rest)))(floats)
     """
 
     gaussians: Gaussians

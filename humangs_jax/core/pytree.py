@@ -6,12 +6,14 @@ never calls `__init__`, so shape checks of the constructor (jaxtyping) hold for 
 
 import dataclasses
 import functools
+import json
 import operator
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -56,7 +58,42 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     _PYTREES.add(cls)
+    _make_exportable(cls)
     return cls
+
+
+_EXPORTABLE: dict[str, str] = {}
+"""Names of pytrees in files of `jax.export`, and the modules that they are from."""
+
+
+def _make_exportable(cls: type[Any]) -> None:
+    """Let `jax.export` serialize functions whose arguments or results are of this class.
+
+    The name in its files is that of the package and the class, so that files outlive a module that moves. Classes that are
+    defined inside functions have no such name.
+    """
+    name = f"{cls.__module__.partition('.')[0]}.{cls.__qualname__}"
+    if "<locals>" in name or cls.__module__ == "__main__":
+        return
+    if name in _EXPORTABLE:  # a module that is loaded again keeps its first class there
+        if _EXPORTABLE[name] != cls.__module__:
+            raise TypeError(f"{cls.__module__} and {_EXPORTABLE[name]} both have a pytree {cls.__qualname__}")
+        return
+    _EXPORTABLE[name] = cls.__module__
+    jax.export.register_pytree_node_serialization(
+        cls, serialized_name=name, serialize_auxdata=_static_bytes, deserialize_auxdata=_static_values
+    )
+
+
+def _static_bytes(values: tuple[Any, ...]) -> bytes:
+    """Static fields as JSON. Raises: TypeError for one that is more than numbers, texts and tuples of them."""
+    return json.dumps(values).encode()
+
+
+def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
+    """Inverse of `_static_bytes`: lists were tuples, because static fields can be hashed."""
+    as_tuples = lambda x: tuple(map(as_tuples, x)) if isinstance(x, list) else x
+    return as_tuples(json.loads(bytes(data)))
 
 
 SHORT = 80
@@ -136,46 +173,120 @@ def _annotated_rank(annotation: Any) -> int | None:
 
 
 def shape_fault(tree: Any) -> str | None:
-    """What is wrong with the shapes of a pytree dataclass, by the annotations of its fields: ".colors: expected shape ...".
+    """What is wrong with the fields of a pytree dataclass, by their annotations: ".colors: expected shape ...".
 
-    Axes of one name have one size, in a batch behind its own axes. None if all fit, or for anything else.
+    Axes of one name have one size. In a batch they come behind its own axes, as many as most of the arrays have. Arrays that
+    are annotated as floating-point numbers hold no integers, and sizes (static fields that are `int`) are whole numbers.
+    None if all fit, or for anything else.
     """
-    cls, sizes = type(tree), {}
+    cls, sizes = type(tree), dict[str, int]()
     if cls not in _PYTREES:
         return None
-    for name, axes in _annotated_axes(cls).items():
+    fields = _annotated_axes(cls)
+    ranks = list(_batch_ranks(tree, fields))
+    usual = max(ranks, key=ranks.count, default=0)  # the first of equally many
+    batch_rank = max(usual, 0) if issubclass(cls, Batchable) else 0
+    for name, field in fields.items():
         value = getattr(tree, name)
-        if axes is None:
-            if fault := shape_fault(value):
-                return f".{name}{fault}"
-            continue
-        shape = getattr(value, "shape", None)
-        if not isinstance(shape, tuple):
-            continue
-        batch = len(shape) - len(axes) if issubclass(cls, Batchable) and len(shape) > len(axes) else 0
-        wanted = [sizes.get(axis, axis) for axis in axes]
-        if len(shape) - batch != len(axes) or any(
-            isinstance(want, int) and want != size for want, size in zip(wanted, shape[batch:], strict=True)
-        ):
-            words = ", ".join(map(str, (*shape[:batch], *wanted))) + ("," if len(wanted) + batch == 1 else "")
-            return f".{name}: expected shape ({words}), got {shape}"
-        sizes |= {axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)}
+        fault = shape_fault(value) if field.axes is None else _array_fault(value, field, batch_rank, sizes)
+        if fault:
+            return f".{name}{fault}"
+    return _size_fault(tree)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Field:
+    """What an annotation says about a field of a pytree."""
+
+    axes: tuple[str | int, ...] | None
+    """Names and sizes; None where it is no array but a pytree of its own."""
+    floating: bool
+    """It holds floating-point numbers."""
+    optional: bool
+    """It may be None."""
+
+
+def _batch_ranks(tree: Any, fields: dict[str, _Field]) -> Iterator[int]:
+    """Of each array of a pytree: how many axes it has more than its annotation."""
+    for name, field in fields.items():
+        shape = getattr(getattr(tree, name), "shape", None)
+        if field.axes is not None and isinstance(shape, tuple):
+            yield len(shape) - len(field.axes)
+
+
+def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
+    """What is wrong with one array. sizes: of the axes that are known, to which those of this array are added."""
+    axes = field.axes
+    assert axes is not None
+    wanted = [sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes]
+    if value is None and field.optional:
+        return None
+    shape = getattr(value, "shape", None)
+    if not isinstance(shape, tuple):
+        if not axes and isinstance(value, int | float):
+            return None  # a number is an array without axes
+        return f": expected an array of shape {_shown_shape(wanted)}, got {_shown_kind(value)}"
+    # a leaf that a batch shares has no batch axes
+    batch = batch_rank if len(shape) == batch_rank + len(axes) else 0
+    fits = len(shape) == batch + len(axes)
+    for want, size in zip(wanted, shape[batch:], strict=False):
+        fits = fits and (isinstance(want, str) or want == size)
+    if not fits:
+        return f": expected shape {_shown_shape([*shape[:batch], *wanted])}, got {shape}"
+    if field.floating and not jnp.issubdtype(value.dtype, jnp.inexact) and value.dtype != jax.dtypes.float0:
+        return f": expected floating-point numbers, got {value.dtype}{_advice(value.dtype)}"
+    sizes |= {axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)}
+    return None
+
+
+def _shown_shape(axes: Sequence[str | int]) -> str:
+    return f"({', '.join(map(str, axes))}{',' * (len(axes) == 1)})"
+
+
+def _shown_kind(value: Any) -> str:
+    return "None" if value is None else f"{type(value).__name__}; jnp.asarray makes one"
+
+
+def _advice(dtype: Any) -> str:
+    """What to do with integers."""
+    return "; colors of 0 to 255 are divided by 255" if dtype == np.uint8 else "; x.astype(float) makes them"
+
+
+def _size_fault(tree: Any) -> str | None:
+    """The first static field that should be an integer and is none."""
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if field.metadata.get("static") and field.type is int and not isinstance(value, int | np.integer):
+            return f".{field.name}: expected a whole number, got {value!r}"
     return None
 
 
 @functools.cache
-def _annotated_axes(cls: Any) -> dict[str, list[Any] | None]:
-    """By field: its axes, names and sizes, or None where it is no array (a pytree of its own, or static)."""
-    fields = [field for field in dataclasses.fields(cls) if not field.metadata.get("static")]
+def _annotated_axes(cls: Any) -> dict[str, _Field]:
+    """The fields that are not static, without arrays of any shape."""
     found = {}
-    for field in fields:
+    for field in dataclasses.fields(cls):
+        if field.metadata.get("static"):
+            continue
         options = typing.get_args(field.type) or (field.type,)
-        texts = [str(x.dim_str) for x in options if hasattr(x, "dim_str")]
-        axes = [int(axis) if axis.isdigit() else axis for axis in texts[0].split()] if texts else None
-        if axes is not None and not all(isinstance(axis, int) or axis.strip("_").isidentifier() for axis in axes):
+        arrays = [x for x in options if hasattr(x, "dim_str")]
+        optional = type(None) in options
+        if not arrays:
+            found[field.name] = _Field(None, False, optional)
+            continue
+        texts = str(arrays[0].dim_str).split()
+        axes = tuple(int(axis) if axis.isdigit() else axis for axis in texts)
+        if not all(isinstance(axis, int) or axis.strip("_").isidentifier() for axis in axes):
             continue  # of any shape
-        found[field.name] = axes
+        floating = all(_is_floating(x) for x in arrays)
+        found[field.name] = _Field(axes, floating, optional)
     return found
+
+
+def _is_floating(annotation: Any) -> bool:
+    """Whether a jaxtyping annotation stands for floating-point numbers only."""
+    kinds = annotation.dtypes
+    return isinstance(kinds, list | tuple) and all("float" in str(kind) for kind in kinds)
 
 
 def replace(tree: T, **changes: Any) -> T:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values
+from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values, checked_arguments
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
@@ -152,6 +152,7 @@ class UnconstrainedGaussians(Batchable):
     harmonics: Float[Array, "g k 3"] | None = None
 
 
+@checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
     """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
 
@@ -184,6 +185,7 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), parameters)
 
 
+@checked_arguments
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
     """The Gaussians that parameters stand for: scales are positive, opacities and colors in (0, 1).
 

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from numbers import Real
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -253,15 +254,23 @@ def _color(background: object, dtype: np.dtype) -> Array:
     if isinstance(background, str):
         return jnp.asarray(named_color(background), dtype)
     if hasattr(background, "shape"):
-        color, fits = background, background.shape == (3,)
+        color, fits = background, background.shape == (3,) and not _of_bytes(background)
     else:
         color = background
         fits = isinstance(background, Sequence) and len(background) == 3
         fits = fits and all(isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background)
     if not fits:
-        shown = f"shape {color.shape}" if hasattr(color, "shape") else repr(color)
+        shape = getattr(color, "shape", (3,))
+        shown = f"shape {shape}" if shape != (3,) else repr(color)
         raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}")
     return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
+
+
+def _of_bytes(color: Any) -> bool:
+    """Whether an array of integers is no color in [0, 1]. Traced values are not looked at."""
+    if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
+        return False
+    return bool(np.any(np.asarray(color) > 1))
 
 
 def draw_projected(

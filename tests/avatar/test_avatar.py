@@ -1,5 +1,6 @@
 import json
 
+import equinox
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,18 @@ def make_avatar(seed=0):
 def make_pose(seed=1):
     rng = np.random.default_rng(seed)
     return BodyPose(jnp.asarray(rng.normal(size=(3, 3)), jnp.float32), jnp.asarray(rng.normal(size=3), jnp.float32))
+
+
+def test_a_gradient_with_regard_to_an_avatar_leaves_its_integers_out():
+    avatar, pose = make_avatar(), make_pose()
+    loss = lambda avatar: jnp.sum(jnp.square(skin(avatar, pose).means))
+    by_part = jax.grad(lambda part: loss(replace(avatar, gaussians=part)))(avatar.gaussians)
+    floats, rest = equinox.partition(avatar, equinox.is_inexact_array)
+    by_floats = jax.grad(lambda floats: loss(equinox.combine(floats, rest)))(floats)
+    assert np.abs(by_part.means).max() > 0.1 and by_floats.faces is None
+    jax.tree.map(np.testing.assert_array_equal, by_part, by_floats.gaussians)
+    with_integers = jax.grad(loss, allow_int=True)(avatar)
+    np.testing.assert_array_equal(with_integers.skinning_weights, by_floats.skinning_weights)
 
 
 @pytest.mark.parametrize("functions", [0, 8])

@@ -20,6 +20,7 @@ from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras
 from humangs_jax.network.runtime import Runtime
+from humangs_jax.rendering import splatting
 
 COUNT = 7
 GAUSSIANS = hg.Gaussians(jnp.zeros((COUNT, 3)), jnp.ones((COUNT, 4)), jnp.ones((COUNT, 3)), jnp.ones(COUNT), jnp.ones((COUNT, 3)))
@@ -73,6 +74,26 @@ WRONG = {
     ),
     "a color": (lambda: hg.render(GAUSSIANS, CAMERA, background="blak"), "background 'blak': expected a color"),
     "bytes": (lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0, 255)), r"background: expected 3 numbers in \[0, 1\]"),
+    "an array of bytes": (
+        lambda: splatting._color(np.asarray([0, 0, 255]), np.dtype("float32")),
+        r"background: expected 3 numbers in \[0, 1\]",
+    ),
+    "opacities of 3DGS": (
+        lambda: hg.render(replace(GAUSSIANS, opacities=GAUSSIANS.opacities[:, None]), CAMERA),
+        r"gaussians.opacities: expected shape \(7,\), got \(7, 1\)$",
+    ),
+    "colors of bytes": (
+        lambda: hg.unconstrain(replace(GAUSSIANS, colors=jnp.zeros((COUNT, 3), jnp.uint8))),
+        r"^unconstrain\(gaussians\): gaussians.colors: expected floating-point numbers, got uint8",
+    ),
+    "a list of means": (
+        lambda: hg.render(replace(GAUSSIANS, means=np.zeros((COUNT, 3)).tolist()), CAMERA),
+        r"gaussians.means: expected an array of shape \(g, 3\), got list; jnp.asarray makes one",
+    ),
+    "integers in an export": (
+        lambda: hg.export("a.ply", replace(AVATAR, rest_vertices=jnp.zeros((4, 3), int))),
+        r"avatar.rest_vertices: expected floating-point numbers, got int32",
+    ),
     "degrees": (lambda: intrinsics_from_fov(40.0, 8, 8), r"vertical_fov 40: expected radians .*np.deg2rad\(40\)"),
     "degrees of an orbit": (
         lambda: hg.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 30.0, jnp.eye(3), 8, 8),

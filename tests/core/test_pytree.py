@@ -4,10 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small import small_avatar, small_body
 
+import humangs_jax as hg
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.core import pytree
+from humangs_jax.core.pytree import pytree_dataclass, replace, shape_fault, static_field
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import Rendering
@@ -112,3 +115,61 @@ def test_pytrees_print_on_one_short_line():
     traced = []
     jax.jit(lambda c: (traced.append(repr(c)), c.K)[1])(camera())
     assert traced == [text]
+
+
+# What is handed in is checked by the annotations ----------------------------------------------------------------------
+
+GAUSSIANS = Gaussians(jnp.zeros((7, 3)), jnp.ones((7, 4)), jnp.ones((7, 3)), jnp.ones(7), jnp.ones((7, 3)))
+BATCH = jax.tree.map(lambda x: jnp.stack([x, x]), GAUSSIANS)
+BYTES = jnp.full((7, 3), 200, jnp.uint8)
+FAULTS = {
+    "a trailing axis": (GAUSSIANS, {"opacities": jnp.ones((7, 1))}, r".opacities: expected shape (7,), got (7, 1)"),
+    "a leading axis": (GAUSSIANS, {"scales": jnp.ones((1, 7, 3))}, r".scales: expected shape (7, 3), got (1, 7, 3)"),
+    "first of all": (GAUSSIANS, {"means": jnp.ones((7, 3, 1))}, r".means: expected shape (g, 3), got (7, 3, 1)"),
+    "in a batch": (BATCH, {"opacities": jnp.ones((2, 7, 1))}, r".opacities: expected shape (7,), got (2, 7, 1)"),
+    "too few in a batch": (BATCH, {"colors": jnp.ones((2, 6, 3))}, r".colors: expected shape (2, 7, 3), got (2, 6, 3)"),
+    "bytes": (GAUSSIANS, {"colors": BYTES}, ".colors: expected floating-point numbers, got uint8; colors of 0 to 255 are"),
+    "integers": (GAUSSIANS, {"means": jnp.zeros((7, 3), int)}, ".means: expected floating-point numbers, got int32; "),
+    "booleans": (GAUSSIANS, {"opacities": jnp.ones(7, bool)}, ".opacities: expected floating-point numbers, got bool"),
+    "a list": (GAUSSIANS, {"quats": [[1.0] * 4] * 7}, ".quats: expected an array of shape (7, 4), got list; jnp.asarray"),
+    "nothing": (GAUSSIANS, {"means": None}, ".means: expected an array of shape (g, 3), got None"),
+    "pixels": (camera(), {"width": 64.0}, ".width: expected a whole number, got 64.0"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_field_that_does_not_fit_is_named(name):
+    tree, changes, words = FAULTS[name]
+    assert shape_fault(replace(tree, **changes)).startswith(words)
+
+
+def test_what_fits_has_no_fault():
+    none = replace(GAUSSIANS, low_pass=None)
+    of_numpy = jax.tree.map(np.asarray, GAUSSIANS)
+    half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), GAUSSIANS)
+    for tree in (GAUSSIANS, none, BATCH, of_numpy, half, camera(), batch(), replace(camera(), width=np.int64(4))):
+        assert shape_fault(tree) is None
+
+
+# Files of jax.export ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tree", [GAUSSIANS, BATCH, camera(), small_avatar(), small_body()], ids=lambda tree: type(tree).__name__)
+def test_functions_of_public_classes_come_back_from_files_of_jax_export(tree):
+    twice = jax.jit(lambda x: jax.tree.map(lambda leaf: leaf * 2, x))
+    data = jax.export.export(twice)(tree).serialize()
+    back = jax.export.deserialize(data).call(tree)
+    assert jax.tree.structure(back) == jax.tree.structure(tree)
+    jax.tree.map(np.testing.assert_array_equal, back, twice(tree))
+
+
+def test_a_structure_comes_back_with_its_static_fields():
+    body = small_body()
+    back = jax.export.deserialize(jax.export.export(jax.jit(lambda x: x))(body).serialize()).in_tree
+    assert back == jax.tree.structure(((body,), {}))
+
+
+def test_every_public_pytree_has_a_name_in_files_of_jax_export():
+    public = [value for name in hg.__all__ if isinstance(value := getattr(hg, name), type) and value in pytree._PYTREES]
+    assert len(public) >= 5
+    assert {f"humangs_jax.{each.__name__}" for each in public} <= set(pytree._EXPORTABLE)

@@ -246,6 +246,7 @@ def frame_range(text: str, count: int) -> range:
     return frames
 
 
+@checked_arguments
 def export(
     path: str | os.PathLike[str],
     avatar: Avatar,
