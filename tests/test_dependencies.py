@@ -9,6 +9,7 @@ ROOT = Path(__file__).parents[1]
 IMPORT = re.compile(r"^\s*(?:from (\w+)[\w.]* import \w|import (\w+)(?:\.\w+)*(?: as \w+)?(?:  #.*)?$)", re.MULTILINE)
 OURS = {"humangs_jax", "tests", "experiments"}
 NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax", "yaml": "PyYAML"}
+NAMES |= dict.fromkeys(("backports", "compression"), "backports.zstd")  # Python 3.14 has it as compression.zstd
 """Distributions that are not called like their module."""
 UNTESTED = {"torch", "bpy"}
 """Imported by scripts that made stored references, and by those that Blender runs."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.avatar.export import EXPORTS, VIDEOS
+from humangs_jax.avatar.export import EXPORTS, OTHERS, VIDEOS
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
@@ -130,7 +130,7 @@ class Render:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         if self.capture is not None:
             self._require_defaults()
-        if self.avatar.suffix.lower() in SPLATS:
+        if self.avatar.suffix.lower() in (*SPLATS, *OTHERS):
             return self._render_gaussians(views)
         if self.camera is not None:
             raise UsageError(f"--camera: {self.avatar} is an avatar, which --capture gives cameras and poses")

@@ -347,6 +347,8 @@ class Export:
     up: Annotated[Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")] = None
     rest: bool = False
     """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
+    spz_version: Literal[3, 4] | None = None
+    """Version of a .spz. Default: 3, which more programs read."""
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
@@ -385,6 +387,8 @@ class Export:
             raise UsageError(f"--frame {self.frame}: does not go with {with_it}")
         if self.rest and form is not None and not form.rest_fields:
             raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
+        if self.spz_version is not None and (form is None or not form.versions):
+            raise UsageError(f"--spz-version {self.spz_version}: expected a name of --out that ends in .spz")
 
     def _format(self, out: Path | None) -> "ExportFormat | None":
         return None if out is None else chosen_format(out.suffix, self.mesh)
@@ -397,7 +401,7 @@ class Export:
         name = "motion" if self.motion is None else self.motion.stem
         if motion is not None:
             motion, numbers = self._frames(motion, form.animated)
-        options = {"mesh": form.mesh, "up": self.up, "rest_fields": self.rest, "name": name}
+        options = {"mesh": form.mesh, "up": self.up, "rest_fields": self.rest, "version": self.spz_version, "name": name}
         with stage("writing"):
             files = export(out, avatar, motion, None if form.animated else numbers, **options)
         what = f"{len(avatar.faces):,} triangles" if form.mesh else f"{len(avatar.gaussians.means):,} Gaussians"

@@ -29,7 +29,8 @@ from humangs_jax.avatar.export.gaussians import (
     rotated,
     turned,
 )
-from humangs_jax.avatar.export.splats import write_glb, write_ply, write_splat, write_spz
+from humangs_jax.avatar.export.splats import write_glb, write_ply, write_splat
+from humangs_jax.avatar.export.spz import write_spz
 from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import imported

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import struct
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 from small import random_gaussians
 
 import humangs_jax as hg
+from humangs_jax.avatar.export.spz import zstd
 from humangs_jax.core.pytree import replace
 from humangs_jax.io.reading import FileError, Limits, set_limits
 from humangs_jax.rendering.gaussians import Gaussians, covariances
@@ -80,7 +82,8 @@ def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=Fals
     """3DGS, as its authors' program lays it out."""
     g = gaussians
     rest = np.zeros((len(g.means), 0)) if g.harmonics is None else np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
-    columns = dict(zip("xyz", np.asarray(g.means).T, strict=True)) | {name: np.arange(20) for name in extra}
+    extra = extra if isinstance(extra, dict) else dict.fromkeys(extra, np.arange(20))
+    columns = dict(zip("xyz", np.asarray(g.means).T, strict=True)) | extra
     columns |= {f"f_dc_{i}": (np.asarray(g.colors)[:, i] - 0.5) / C0 for i in range(3)}
     columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
     p = np.asarray(g.opacities, np.float64)
@@ -145,11 +148,11 @@ def compressed_ply(gaussians, colors_bounded=True):
 
 
 def spz(gaussians, version):
-    """Of Niantic, by its specification."""
+    """Of Niantic, by its specification; 4 is `spz_four` of these arrays."""
     g, bits = gaussians, 12
     k = 0 if g.harmonics is None else g.harmonics.shape[1]
     quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
-    if version == 2:
+    if version < 3:
         rotations = np.rint(127.5 * np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 127.5).astype("u1").tobytes()
     else:
         largest, three = smallest_three(quats[:, [1, 2, 3, 0]])
@@ -160,10 +163,24 @@ def spz(gaussians, version):
         rotations = words.astype("<u4").tobytes()
     byte = lambda x: np.clip(np.rint(x), 0, 255).astype("u1").tobytes()
     fixed = np.rint(np.asarray(g.means) * 2**bits).astype(int).reshape(-1).tolist()
-    body = b"".join((n % 2**24).to_bytes(3, "little") for n in fixed) + byte(255 * np.asarray(g.opacities))
-    body += byte(255 * (0.15 * (np.asarray(g.colors) - 0.5) / C0 + 0.5)) + byte(16 * (np.log(g.scales) + 10)) + rotations
-    body += byte(128 * np.asarray(g.harmonics) + 128) if k else b""
-    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 20, COUNTS.index(k), bits, 1, 0) + body)
+    places = b"".join((n % 2**24).to_bytes(3, "little") for n in fixed)
+    places = np.asarray(g.means).astype("<f2").tobytes() if version == 1 else places
+    colors = byte(255 * (0.15 * (np.asarray(g.colors) - 0.5) / C0 + 0.5))
+    parts = [places, byte(255 * np.asarray(g.opacities)), colors, byte(16 * (np.log(g.scales) + 10)), rotations]
+    parts += [byte(128 * np.asarray(g.harmonics) + 128)] if k else []
+    if version == 4:
+        return spz_four(parts, degree=COUNTS.index(k), bits=bits)
+    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 20, COUNTS.index(k), bits, 1, 0) + b"".join(parts))
+
+
+def spz_four(parts, count=20, degree=0, bits=12, flags=0, records=b"", sizes=None, toc=None):
+    """Version 4: a plain header, records of others, a table, and a zstd frame for each array."""
+    frames = [zstd.compress(part) for part in parts]
+    sizes = [len(part) for part in parts] if sizes is None else sizes
+    table = b"".join(struct.pack("<QQ", len(frame), size) for frame, size in zip(frames, sizes, strict=True))
+    at = 32 + len(records) if toc is None else toc
+    header = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, count, degree, bits, flags, len(parts), at)
+    return header + records + table + b"".join(frames)
 
 
 def glb(gaussians, node=None, change=lambda content: None, short=False):
@@ -204,12 +221,14 @@ BY_HAND = {
     "float": (ply, STEPS[".ply"]),
     "double": (lambda g: ply(g, "<f8"), STEPS[".ply"]),
     "big-endian, with other properties and faces": (
-        lambda g: ply(g, ">f4", "binary_big_endian", ("nx", "filter_3D"), faces=True),
+        lambda g: ply(g, ">f4", "binary_big_endian", ("nx", "label"), faces=True),
         STEPS[".ply"],
     ),
     "text": (lambda g: ply(g, form="ascii", extra=("nx",)), STEPS[".ply"]),
     "compressed": (compressed_ply, PACKED),
     "compressed, colors from 0 to 1": (lambda g: compressed_ply(g, colors_bounded=False), PACKED),
+    "spz 1": (lambda g: spz(g, 1), (2e-3, 0.09, *STEPS[".spz"][2:])),
+    "spz 4": (lambda g: spz(g, 4), (2.0**-13, *STEPS[".spz"][1:])),
     "spz 2": (lambda g: spz(g, 2), (2.0**-13, 0.09, *STEPS[".spz"][2:])),
     "spz 3": (lambda g: spz(g, 3), (2.0**-13, *STEPS[".spz"][1:])),
     "glb": (glb, STEPS[".glb"]),
@@ -258,6 +277,17 @@ def with_nan(field, place=(3,)):
     return replace(scene(3), **{field: getattr(scene(3), field).at[place].set(np.nan)})
 
 
+def of_degree_4():
+    return replace(scene(), harmonics=jnp.zeros((20, 24, 3)))
+
+
+SIZES = [20 * width for width in (9, 1, 3, 3, 4)]
+
+
+def zeros(harmonics=0):
+    return [bytes(size) for size in SIZES] + [bytes(60 * harmonics)] * bool(harmonics)
+
+
 def without(name):
     return lambda content: content["meshes"][0]["primitives"][0]["attributes"].pop(f"{EXTENSION}:{name}")
 
@@ -271,12 +301,13 @@ def spz_of(version=3, count=20, degree=0, body=b"", behind=b""):
 
 
 BAD = {
-    "ply of NaN": (lambda: ply(with_nan("scales")), r"scale_\*: expected numbers in \[0"),
-    "ply of NaN in text": (lambda: ply(with_nan("harmonics"), form="ascii"), r"f_rest_\*: expected"),
+    "ply of NaN": (lambda: ply(with_nan("scales", ...)), r"scale_\*: none of 20 Gaussians has finite numbers"),
+    "ply of NaN in text": (lambda: ply(with_nan("harmonics", ...), form="ascii"), r"f_rest_\*: none of 20"),
+    "ply of degree 4": (lambda: ply(of_degree_4()), "of degree 1 to 3, got 72 of degree 4"),
     "ply cut off": (lambda: ply(scene())[:-1], "element vertex: 20 of them are not in"),
     "ply of few lines": (lambda: ply(scene(), form="ascii").rsplit(b"\n", 2)[0], "expected 20 lines of 14 numbers"),
     "ply of points": (lambda: ply(scene()).replace(b"f_dc_0", b"red"), "f_dc_0: missing: expected Gaussians"),
-    "ply of 8 harmonics": (lambda: ply(scene(3)).replace(b"f_rest_8", b"rest_8"), "expected 9, 24 or 45 properties, got 8"),
+    "ply of 8 harmonics": (lambda: ply(scene(3)).replace(b"f_rest_8", b"rest_8"), "properties, of degree 1 to 3, got 8"),
     "ply of 10^15": (lambda: headed("element vertex 1000000000000000", "property float x"), "the limit gaussians is"),
     "ply of -1": (lambda: headed("element vertex -1", "property float x"), "header: 'element vertex -1'"),
     "ply of nothing each": (lambda: headed("element vertex 9"), "element vertex: 9 of them"),
@@ -293,9 +324,21 @@ BAD = {
     "spz cut off": (lambda: spz(scene(), 3)[:-30], "not a readable file of Gaussians"),
     "spz too short": (lambda: spz_of(body=bytes(399)), "20 Gaussians in 400 bytes, got less"),
     "spz with more behind": (lambda: spz_of(body=bytes(400), behind=b"more"), "not a readable file of Gaussians"),
-    "spz 4": (lambda: spz_of(version=4), "version 2 or 3 and degree 0 to 3, got version 4"),
-    "another gzip": (lambda: gzip.compress(b"hello"), "version 2 or 3"),
-    "glb of NaN": (lambda: glb(with_nan("opacities")), "OPACITY: expected numbers in"),
+    "spz 4 in a gzip": (lambda: spz_of(version=4), "no .spz of version 1 to 4: version 4 in what begins as version 3 does"),
+    "spz of degree 4": (lambda: spz_of(degree=4), "harmonics of degree 4: expected .spz of degree 0 to 3"),
+    "spz 4 of degree 4": (lambda: spz_four(zeros(24), degree=4), "harmonics of degree 4"),
+    "spz 5": (lambda: spz(scene(), 4).replace(b"NGSP\4", b"NGSP\5"), "version 5"),
+    "spz 4 of 2^32": (lambda: spz_four(zeros(), count=2**32 - 1), "4,294,967,295 Gaussians: the limit gaussians"),
+    "spz 4 of 19 million": (lambda: spz_four(zeros(), count=19_000_000), "bytes unpack to"),
+    "spz 4 of longer streams": (lambda: spz_four(zeros(), count=19), "expected streams of 171, 19"),
+    "spz 4, a bomb": (lambda: spz_four([bytes(1 << 24), *zeros()[1:]], sizes=SIZES), "unpacks to more than the 180"),
+    "spz 4 of a short stream": (lambda: spz_four([b"", *zeros()[1:]], sizes=SIZES), "unpacks to less than the 180"),
+    "spz 4 cut off": (lambda: spz(scene(), 4)[:-1], "cut short: a stream of"),
+    "spz 4 cut in its header": (lambda: spz(scene(), 4)[:30], "cut short: expected a header of 32 bytes"),
+    "spz 4 with its table elsewhere": (lambda: spz_four(zeros(), toc=2**32 - 1), "table of 5 streams at 4,294,967,295"),
+    "spz 4 of noise": (lambda: spz(scene(), 4)[:112] + bytes(range(200)), "cut short|not a readable file of Gaussians"),
+    "another gzip": (lambda: gzip.compress(b"hello"), "no .spz of version 1 to 4"),
+    "glb of NaN": (lambda: glb(with_nan("opacities", ...)), "OPACITY: none of 20"),
     "glb without rotations": (lambda: glb(scene(), change=without("ROTATION")), "ROTATION: missing"),
     "glb without a harmonic": (lambda: glb(scene(3), change=without("SH_DEGREE_1_COEF_1")), "SH_DEGREE_1_COEF_1: missing"),
     "glb of many scales": (lambda: glb(scene(), change=lambda c: c["accessors"][1].update(count=10**15)), "bytes unpacked"),
@@ -343,6 +386,111 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path):
         with pytest.raises(ValueError, match=message):
             hg.save_gaussians(tmp_path / name, gaussians)
     assert not list(tmp_path.iterdir())
+
+
+def test_version_4_is_written_and_read(tmp_path):
+    """The table names each array, no more; both versions hold the same numbers."""
+    for count in COUNTS:
+        for version in (3, 4):
+            hg.save_gaussians(tmp_path / f"{version}.spz", scene(count), version=version)
+        assert (tmp_path / "4.spz").read_bytes()[:5] == b"NGSP\4"
+        assert_close(hg.load_gaussians(tmp_path / "4.spz"), hg.load_gaussians(tmp_path / "3.spz"), [0] * 5)
+    with pytest.raises(ValueError, match="version: expected 3 or 4, got 2"):
+        hg.save_gaussians(tmp_path / "a.spz", scene(), version=2)
+    with pytest.raises(ValueError, match=r"a\.ply: has no versions: expected a name ending in \.spz"):
+        hg.save_gaussians(tmp_path / "a.ply", scene(), version=4)
+
+
+def test_six_streams_of_which_one_is_empty_are_read(tmp_path):
+    (tmp_path / "a.spz").write_bytes(spz_four([*zeros(), b""]))
+    assert len(hg.load_gaussians(tmp_path / "a.spz").means) == 20
+
+
+def test_what_a_spz_says_and_is_not_used_is_told(tmp_path, caplog):
+    system = struct.pack("<III", 0xADBE0003, 4, 1)
+    other = struct.pack("<II", 0x12340001, 3) + b"abc"
+    (tmp_path / "a.spz").write_bytes(spz_four(zeros(), flags=3, records=system + other))
+    hg.load_gaussians(tmp_path / "a.spz")
+    (line,) = caplog.messages
+    assert line.startswith(f"{tmp_path / 'a.spz'}: ") and "antialiased" in line
+    assert "the coordinate system" in line and "0x12340001" in line
+
+
+@pytest.mark.parametrize("suffix", STEPS)
+def test_gaussians_that_are_not_finite_are_left_out_and_counted(suffix, tmp_path, caplog):
+    """A NaN in a mean, an infinite scale and a quaternion of NaN, as far as the format can hold them."""
+    if suffix == ".spz":
+        pytest.skip("holds finite numbers alone")
+    bad = scene()
+    bad = replace(bad, means=bad.means.at[3, 1].set(np.nan), scales=bad.scales.at[[7, 9], 2].set(np.inf))
+    path, good = tmp_path / f"a{suffix}", np.delete(np.arange(20), [3, 7, 9])
+    if suffix == ".splat":
+        hg.save_gaussians(path, scene())
+        rows = np.frombuffer(path.read_bytes(), "<f4").reshape(20, 8).copy()
+        rows[3, 1], rows[[7, 9], 5] = np.nan, np.inf
+        path.write_bytes(rows.tobytes())
+    else:
+        path.write_bytes({".ply": ply, ".glb": glb}[suffix](bad))
+    found = hg.load_gaussians(path)
+    np.testing.assert_allclose(found.means, np.asarray(scene().means)[good], atol=1e-6)
+    np.testing.assert_allclose(found.opacities, np.asarray(scene().opacities)[good], atol=STEPS[suffix][2])
+    assert "3 of 20 Gaussians are left out" in caplog.text and str(path) in caplog.text
+
+
+def test_chunks_without_bounds_are_left_out(tmp_path, caplog):
+    many = scene(g=300)
+    data = compressed_ply(many)
+    at = data.index(b"end_header\n") + len(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(data[:at] + np.full(1, np.nan, "<f4").tobytes() + data[at + 4 :])
+    assert len(hg.load_gaussians(tmp_path / "a.ply").means) == 300 - 256
+    assert "256 of 300 Gaussians are left out" in caplog.text
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_the_smoothing_filter_of_mip_splatting_is_in_scales_and_opacities(form, tmp_path):
+    """By the formula of its own `save_fused_ply`: the filter has twenty scales, 0 among them."""
+    kept, filters = scene(), np.arange(20)[:, None] / 40
+    (tmp_path / "a.ply").write_bytes(ply(kept, form=form, extra={"filter_3D": filters[:, 0]}))
+    scales, found = np.asarray(kept.scales, np.float64), hg.load_gaussians(tmp_path / "a.ply")
+    wide = np.sqrt(scales**2 + filters**2)
+    np.testing.assert_allclose(np.sort(found.scales), np.sort(wide), rtol=1e-5)
+    share = np.sqrt((scales**2).prod(axis=1) / (wide**2).prod(axis=1))
+    np.testing.assert_allclose(found.opacities, kept.opacities * share, atol=1e-6)
+
+
+def test_properties_that_are_not_used_are_named(tmp_path, caplog):
+    (tmp_path / "a.ply").write_bytes(ply(scene(), extra=("nx", "beta", "asg_0")))
+    hg.load_gaussians(tmp_path / "a.ply")
+    assert caplog.messages == [f"{tmp_path / 'a.ply'}: properties that are not used: beta, asg_0"]
+    caplog.clear()
+    (tmp_path / "a.ply").write_bytes(ply(scene(3), extra=("nx", "ny", "nz", "red"), faces=True))
+    hg.load_gaussians(tmp_path / "a.ply")
+    assert not caplog.messages
+
+
+def test_kernels_and_attributes_of_a_glb_that_are_not_used_are_named(tmp_path, caplog):
+    def change(content):
+        (part,) = content["meshes"][0]["primitives"]
+        part["extensions"][EXTENSION]["kernel"] = "beta"
+        part["attributes"][f"{EXTENSION}:SH_DEGREE_4_COEF_0"] = 0
+
+    (tmp_path / "a.glb").write_bytes(glb(scene(), change=change))
+    hg.load_gaussians(tmp_path / "a.glb")
+    assert "kernel 'beta'" in caplog.text and "SH_DEGREE_4_COEF_0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.sog", "PlayCanvas' SOG: `npx @playcanvas/splat-transform scene.sog"),
+        ("a.ksplat", "mkkellogg's viewer: `npx @playcanvas/splat-transform scene.ksplat"),
+        ("ckpt_29999_rank0.pt", "a checkpoint of torch: write a .ply with the program that trained it"),
+    ],
+)
+def test_other_files_of_gaussians_are_named_with_what_converts_them(name, message, tmp_path):
+    (tmp_path / name).write_bytes(b"PK\3\4 or else")
+    with pytest.raises(FileError, match=re.escape(message)):
+        hg.load_gaussians(tmp_path / name)
 
 
 def test_colors_of_other_spaces_are_told(tmp_path, caplog):

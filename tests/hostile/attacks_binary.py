@@ -14,6 +14,8 @@ from honest_files import pixels
 from hostile_cases import PLACES, capture_with, case, changed, setting, written
 from PIL import Image
 
+from humangs_jax.avatar.export.spz import zstd
+
 # Archives -------------------------------------------------------------------------------------------------------------
 
 
@@ -300,6 +302,16 @@ for kind, (change, item) in GLBS.items():
     case(kind, "glb", glb(change), "either" if "nodes" in kind else "refused", item)
 
 
+def filtered_ply(number):
+    """One Gaussian in text, with Mip-Splatting's filter of that size."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "filter_3D"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property double {name}" for name in names), "end_header"]
+    row = ["1"] * len(names)
+    row[7] = number
+    return "\n".join([*header, " ".join(row), ""]).encode()
+
+
 def gaussians_ply(*lines, size=0):
     header = "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode()
     return written("a.ply", header + bytes(size))
@@ -310,7 +322,32 @@ def spz(count, degree, size=0):
     return written("a.spz", lambda: gzip.compress(header + bytes(size)))
 
 
+def spz_four(count, sizes, streams=5, place=32, behind=b""):
+    """Version 4 with a table that promises these sizes, of frames of zeros that unpack to 64 MB."""
+    frame = zstd.compress(bytes(64 << 20))
+    table = b"".join(struct.pack("<QQ", len(frame), size) for size in sizes)
+    header = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, count, 0, 12, 0, streams, place)
+    return written("a.spz", lambda: header + table + frame * len(sizes) + behind)
+
+
+FEW = [10 * width for width in (9, 1, 3, 3, 4)]
+MANY = [13_000_000 * width for width in (9, 1, 3, 3, 4)]
 GAUSSIANS = {
+    "zstd that unpacks to more than it says": ("spz 4", spz_four(10, FEW), 5),
+    "zstd that unpacks to less than 260 MB": ("spz 4", spz_four(13_000_000, MANY), 5),
+    "a table of 10^18 bytes": ("spz 4", spz_four(10, [10**18] * 5), 5),
+    "4 billion in version 4": ("spz 4", spz_four(2**32 - 1, FEW), 5),
+    "255 streams": ("spz 4", spz_four(10, FEW, streams=255), 6),
+    "a table behind the end": ("spz 4", spz_four(10, FEW, place=2**32 - 1), 6),
+    "a table in the header": ("spz 4", spz_four(10, FEW, place=0), 6),
+    "a header cut off": ("spz 4", written("a.spz", b"NGSP\4\0\0\0\1"), 6),
+    "1,500 properties that nobody knows": (
+        "3dgs",
+        gaussians_ply("element vertex 1", *(f"property float \x1b[31m{i}" for i in range(10_000)), size=40_000),
+        6,
+    ),
+    "a filter of 10^30 m": ("3dgs", written("a.ply", lambda: filtered_ply("1e30")), 6),
+    "all of it NaN": ("3dgs", written("a.ply", lambda: filtered_ply("nan")), 6),
     "10^12 in the header": ("3dgs", gaussians_ply("element vertex 1000000000000", "property float x"), 5),
     "20 million without a file": ("3dgs", gaussians_ply("element vertex 20000000", "property float x", size=99), 5),
     "10 million without properties": ("3dgs", gaussians_ply("element vertex 10000000"), 5),

@@ -239,6 +239,7 @@ ROWS = {
     "3dgs compressed": (load_gaussians, written("a.ply", honest.compressed_ply)),
     "splat": (load_gaussians, saved("a.splat", lambda path: save_gaussians(path, random_gaussians()))),
     "spz": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=15)))),
+    "spz 4": (load_gaussians, saved("a.spz", lambda path: save_gaussians(path, random_gaussians(harmonics=3), version=4))),
     "glb splats": (load_gaussians, saved("a.glb", lambda path: save_gaussians(path, random_gaussians(harmonics=8)))),
     "obj": (colored_mesh, honest.write_obj),
     "ply": (colored_mesh, honest.mesh("ply")),

@@ -1,6 +1,6 @@
 """An avatar in the files that other people's programs open (docs/export.md), and videos of it: the tables of their formats.
 
-`gaussians` has what reads and writes, `splats` the formats of Gaussians, `mesh` those of the body.
+`gaussians` has what reads and writes, `splats` and `spz` the formats of Gaussians, `mesh` those of the body.
 """
 
 import dataclasses
@@ -26,32 +26,35 @@ class ExportFormat(Format):
     """One file holds all frames of a motion."""
     rest_fields: bool = False
     """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path, gaussians, rest_fields)."""
+    versions: tuple[int, ...] = ()
+    """Those that are written, where one may be chosen, the usual one first: code(path, gaussians, version)."""
     backwards: bool = False
     """Its axes are to the right, up and back: half a turn about y from ours."""
     beside: tuple[str, ...] = ()
     """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
-    """Of Gaussians, called with the bytes of a file; raises `io.reading.Refused`."""
-    magic: bytes = b""
-    """How its files begin."""
+    """Of Gaussians, called with the bytes of a file and a list that takes what is to be said of it; raises
+    `io.reading.Refused`."""
+    magic: tuple[bytes, ...] = ()
+    """How its files may begin; empty: that does not tell."""
 
 
 EXPORTS = Formats(
     ply=ExportFormat(
         *("3DGS", f"{HERE}.splats:write_ply", (".ply",)),
-        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.splats:read_ply", "magic": b"ply"},
+        **{"up": "-y", "rest_fields": True, "reader": f"{HERE}.splats:read_ply", "magic": (b"ply",)},
     ),
     splat=ExportFormat(
         *("antimatter15's viewer and others", f"{HERE}.splats:write_splat", (".splat",)),
         **{"up": "-y", "reader": f"{HERE}.splats:read_splat"},
     ),
     spz=ExportFormat(
-        *("Niantic's, compressed", f"{HERE}.splats:write_spz", (".spz",)),
-        **{"backwards": True, "reader": f"{HERE}.splats:read_spz", "magic": b"\x1f\x8b\x08"},
+        *("Niantic's, compressed", f"{HERE}.spz:write_spz", (".spz",)),
+        **{"backwards": True, "versions": (3, 4), "reader": f"{HERE}.spz:read_spz", "magic": (b"\x1f\x8b\x08", b"NGSP")},
     ),
     glb=ExportFormat(
         *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.splats:write_glb", (".glb",)),
-        **{"reader": f"{HERE}.splats:read_glb", "magic": b"glTF"},
+        **{"reader": f"{HERE}.splats:read_glb", "magic": (b"glTF",)},
     ),
     mesh=ExportFormat(
         *("with --mesh the body with texture, skin and motion", f"{HERE}.mesh:write_animation", (".glb",)),
@@ -63,6 +66,19 @@ EXPORTS = Formats(
     ),
 )
 """By name; a suffix has at most one format of Gaussians and one of meshes."""
+
+_CONVERT = "`npx @playcanvas/splat-transform {} scene.ply` makes a .ply of it"
+_CHECKPOINT = (
+    "a checkpoint of torch: write a .ply with the program that trained it (gsplat: `simple_trainer.py --save_ply`, or "
+    "`gsplat.export_splats`; nerfstudio: `ns-export gaussian-splat`)"
+)
+OTHERS = {
+    ".sog": f"a bundle of PlayCanvas' SOG: {_CONVERT.format('scene.sog')}",
+    ".ksplat": f"a compressed file of mkkellogg's viewer: {_CONVERT.format('scene.ksplat')}",
+    ".lcc": f"XGRIDS' LCC: {_CONVERT.format('scene.lcc')}",
+    **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
+}
+"""What is said of files of Gaussians that are not read, by suffix."""
 
 
 @dataclasses.dataclass(frozen=True)

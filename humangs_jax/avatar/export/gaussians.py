@@ -6,6 +6,7 @@ the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCan
 `export` turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
 """
 
+import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
+from humangs_jax.avatar.export import EXPORTS, OTHERS, ExportFormat, Up, chosen_format
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments
@@ -31,6 +32,7 @@ from humangs_jax.io.arrays import check_array
 from humangs_jax.io.reading import Refused, read_bytes, reading
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, turned_harmonics, widened
 
+logger = logging.getLogger(__name__)
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic Y00 = 1 / (2 sqrt(pi))."""
 SEEN = 0.5
@@ -139,23 +141,28 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     Raises:
         FileNotFoundError: There is no such file.
         FileError: It cannot be read, is larger than the limits allow, or has other numbers than it should: file and property.
+            Gaussians with numbers that are not finite are left out, with a warning; so is what a file says and is not used.
 
     Examples:
         >>> scene = hg.load_gaussians("garden.ply", y_up=True)
         >>> image = hg.render(scene, camera, "inria")
     """
     with reading(path, "file of Gaussians"):
+        suffix = os.path.splitext(path)[1].lower()
         data = read_bytes(path, "array_bytes")
-        begun = (each for each in EXPORTS.values() if each.magic and data.startswith(each.magic))
-        form = next(begun, None) or chosen_format(os.path.splitext(path)[1])
+        begun = (each for each in EXPORTS.values() if data.startswith(each.magic))
+        form = next(begun, None) or chosen_format(suffix)
         if form is None or not form.reader:
-            raise Refused(f"not known: expected a file ending in {_suffixes()}")
-        gaussians = imported(form.reader)(data)
+            raise Refused(OTHERS.get(suffix, f"not known: expected a file ending in {_suffixes()}"))
+        said: list[str] = []
+        gaussians = imported(form.reader)(data, said)
+        if said:
+            logger.warning("%s: %s", path, "; ".join(dict.fromkeys(said)))
         return _between_worlds(gaussians, form) if y_up else gaussians
 
 
 @checked_arguments
-def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: bool = False) -> None:
+def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: bool = False, version: int | None = None) -> None:
     """Write Gaussians into a file for other programs; it appears whole or not at all.
 
     Deformations become quaternions and scales. A low-pass is taken out of the scales.
@@ -166,9 +173,10 @@ def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: 
         gaussians: With or without harmonics, which `.splat` does not hold (`hg.replace(gaussians, harmonics=None)`).
         y_up: They have y up, and are turned to the world that viewers of the format expect: y down in `.ply` and `.splat`, up in
             `.spz` and `.glb`. False: the numbers stay as they are.
+        version: Of a `.spz`: 3, which more programs read, or 4. None: 3.
 
     Raises:
-        ValueError: Another suffix, numbers that files cannot hold, or harmonics that the format does not.
+        ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the format does not.
 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
@@ -176,7 +184,22 @@ def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: 
     form = chosen_format(os.path.splitext(path)[1])
     if form is None or form.mesh:
         raise ValueError(f"{path}: expected a name ending in {_suffixes()}")
-    form(path, _between_worlds(gaussians, form) if y_up else gaussians)
+    _check_version(path, form, version)
+    form(path, _between_worlds(gaussians, form) if y_up else gaussians, **_versioned(version))
+
+
+def _check_version(path: object, form: ExportFormat, version: int | None) -> None:
+    """Raises: ValueError for a version that is not written."""
+    if version is None or version in form.versions:
+        return
+    if not form.versions:
+        holding = EXPORTS.where(lambda each: bool(each.versions)).suffixes
+        raise ValueError(f"{path}: has no versions: expected a name ending in {alternatives(holding)}")
+    raise ValueError(f"version: expected {' or '.join(map(str, form.versions))}, got {version}")
+
+
+def _versioned(version: int | None) -> dict[str, int]:
+    return {} if version is None else {"version": version}
 
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
@@ -189,11 +212,14 @@ def _suffixes() -> str:
     return alternatives(EXPORTS.where(lambda each: not each.mesh).suffixes)
 
 
-def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]]) -> Gaussians:
+def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:
     """Gaussians of means, quaternions (wxyz), scales, opacities, colors and perhaps harmonics, each named as in its file.
 
-    Raises: Refused for numbers that are not finite, or not what they should be.
+    Those with a number that is not finite are left out, and `said` takes how many.
+
+    Raises: Refused if there are no others, or for numbers that are not what they should be.
     """
+    arrays = _finite(arrays, said)
     count = len(next(iter(arrays.values())))
     fields = ("means", "quats", "scales", "opacities", "colors", "harmonics")
     shapes = ((3,), (4,), (3,), (), (3,), (None, 3))
@@ -203,6 +229,28 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]]) -> Gaussians:
     values = dict(zip(fields, arrays.values(), strict=False))
     values["quats"] = unit_quats(values["quats"])
     return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()})
+
+
+def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, np.ndarray]:
+    """The rows that are finite in all arrays, in float32."""
+    count = len(next(iter(arrays.values())))
+    keep = np.ones(count, bool)
+    bad = []
+    for name, array in arrays.items():
+        if len(array) != count or array.dtype.kind != "f":
+            return arrays  # refused by its shape
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(array.astype(np.float32))
+        rows = finite.all(axis=tuple(range(1, array.ndim)))
+        keep &= rows
+        bad += [] if rows.all() else [name]
+    if not bad:
+        return arrays
+    if not keep.any():
+        raise Refused(f"{', '.join(bad)}: none of {count:,} Gaussians has finite numbers")
+    left_out = count - int(keep.sum())
+    said.append(f"{left_out:,} of {count:,} Gaussians are left out: {', '.join(bad)}: not finite")
+    return {name: array[keep] for name, array in arrays.items()}
 
 
 def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
@@ -256,6 +304,7 @@ def export(
     mesh: bool = False,
     up: Up | None = None,
     rest_fields: bool = False,
+    version: int | None = None,
     name: str = "motion",
 ) -> list[Path]:
     """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears whole or not at all.
@@ -269,6 +318,7 @@ def export(
         mesh: as a mesh where the suffix has formats of Gaussians, too.
         up: the axis that points up; None for the format's own.
         rest_fields: see `write_ply`.
+        version: see `save_gaussians`.
         name: of the animation.
 
     Returns:
@@ -288,6 +338,7 @@ def export(
     if rest_fields and not form.rest_fields:
         holding = EXPORTS.where(lambda each: each.rest_fields).suffixes
         raise ValueError(f"{path}: has no rest fields: expected a name ending in {alternatives(holding)}")
+    _check_version(path, form, version)
     frames = 1 if motion is None else len(motion.translations)
     if not form.animated and frames != (1 if numbers is None else len(numbers)):
         given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
@@ -303,5 +354,5 @@ def export(
         gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
         gaussians = turned(grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up)
         gaussians = rotated(gaussians, BACKWARDS) if form.backwards else gaussians
-        form(file, gaussians, **({"rest_fields": True} if rest_fields else {}))
+        form(file, gaussians, **({"rest_fields": True} if rest_fields else {}), **_versioned(version))
     return files

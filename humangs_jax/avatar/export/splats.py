@@ -1,4 +1,4 @@
-"""Formats of Gaussians: `.ply`, `.splat`, `.spz` and `.glb`.
+"""Formats of Gaussians: `.ply`, `.splat` and `.glb`; `spz` has `.spz`.
 
 `.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
 
@@ -10,14 +10,11 @@ scales and perhaps colors; for each Gaussian four words: position and scale betw
 without its largest component in 2 bits and three times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
 """
 
-import gzip
 import io
 import itertools
-import logging
 import os
 import re
-import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -26,12 +23,12 @@ import numpy as np
 from scipy.special import expit
 
 from humangs_jax.avatar.export.gaussians import colors_of, linear_of, loaded, plain_arrays, sh_of, with_largest
-from humangs_jax.core.array_types import Float, UInt, UInt8
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.motion.clips import node_matrices
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.io.mesh import VERTICES, GlbWriter, count_of, parse_glb, read_accessor
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, shown
+from humangs_jax.io.reading import Refused, check_limit, shown
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
 
 OPACITY_MARGIN = 1e-6
@@ -45,6 +42,14 @@ TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
 """Of the bytes of compressed harmonics: the middle of each step, the ends of the first and last."""
+DEGREE_4 = 72
+"""Properties of harmonics up to degree 4."""
+FILTER = "filter_3D"
+"""The property of Mip-Splatting and GOF that belongs to scales and opacities."""
+KNOWN = re.compile(r"[xyz]|n[xyz]|red|green|blue|alpha|(f_dc|f_rest|scale|rot|packed|min|max)_\w+|opacity|filter_3D")
+"""Properties that are used, or say the same as those."""
+SHOWN = 6
+"""Names in a line."""
 Columns = Mapping[str, np.ndarray]
 
 
@@ -75,12 +80,13 @@ def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: b
     replace_file(path, lambda temporary: content.write(str(temporary)))
 
 
-def read_ply(data: bytes) -> Gaussians:
-    """Gaussians of the bytes of a file. Raises: Refused; what damaged numbers raise."""
+def read_ply(data: bytes, said: list[str]) -> Gaussians:
+    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what damaged numbers raise."""
     elements = _elements(data)
+    said += _unused(elements)
     vertex = elements.get("vertex", {})
     if "chunk" in elements:
-        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}))
+        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}), said)
     arrays = {
         "x, y, z": _columns(vertex, *"xyz"),
         "rot_*": _columns(vertex, *(f"rot_{i}" for i in range(4))),
@@ -88,7 +94,30 @@ def read_ply(data: bytes) -> Gaussians:
         "opacity": expit(_columns(vertex, "opacity")[:, 0]),
         "f_dc_*": colors_of(_columns(vertex, *(f"f_dc_{i}" for i in range(3)))),
     }
-    return loaded(arrays | _harmonics(vertex))
+    if FILTER in vertex:
+        fused = _fused(arrays["scale_*"], arrays["opacity"], _columns(vertex, FILTER))
+        arrays["scale_*"], arrays["opacity"] = fused
+    return loaded(arrays | _harmonics(vertex), said)
+
+
+def _fused(
+    scales: Float[np.ndarray, "g 3"], opacities: Float[np.ndarray, " g"], smoothing: Float[np.ndarray, "g 1"]
+) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, " g"]]:
+    """Scales and opacities with the 3D smoothing filter of Mip-Splatting, a Gaussian of that scale in metres.
+
+    s' = sqrt(s^2 + f^2) and o' = o prod(s / s'), so that the integral over space stays (arXiv 2311.16493, equation 9).
+    """
+    wide = np.hypot(scales, smoothing)
+    shares = np.divide(scales, wide, out=np.ones_like(wide), where=wide > 0)
+    return wide, opacities * shares.prod(axis=1)
+
+
+def _unused(elements: Mapping[str, Columns]) -> list[str]:
+    """What is to be said of properties and elements that have no meaning here."""
+    found = [name for name in elements if name not in ("chunk", "vertex", "sh", "face")]
+    found += [name for each in ("vertex", "chunk", "sh") for name in elements.get(each, {}) if not KNOWN.fullmatch(name)]
+    more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    return [f"properties that are not used: {', '.join(found[:SHOWN])}{more}"] if found else []
 
 
 def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
@@ -99,7 +128,8 @@ def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, 
     """Under their name, nothing if there are none. values: what the bytes of a column stand for."""
     count = sum(name.startswith("f_rest_") for name in columns)
     if count % 3 or count // 3 not in COUNTS:
-        raise Refused(f"f_rest_*: expected 9, 24 or 45 properties, got {count}")
+        degree = " of degree 4" if count == DEGREE_4 else ""
+        raise Refused(f"f_rest_*: expected 9, 24 or 45 properties, of degree 1 to 3, got {count}{degree}")
     if not count:
         return {}
     rest = _columns(columns, *(f"f_rest_{i}" for i in range(count)), dtype=np.float32 if values is None else np.uint8)
@@ -107,7 +137,7 @@ def _harmonics(columns: Columns, values: np.ndarray | None = None) -> dict[str, 
     return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
 
 
-def _unpacked(chunk: Columns, vertex: Columns, sh: Columns) -> Gaussians:
+def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> Gaussians:
     """Gaussians of compressed columns."""
     words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
     bits = {name: np.stack([_bits(words[name], *place) for place in places], axis=1) for name, places in WORDS.items()}
@@ -127,7 +157,7 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns) -> Gaussians:
         "opacity": bits["color"][:, 3],
         "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
     }
-    return loaded(arrays | _harmonics(sh, REST))
+    return loaded(arrays | _harmonics(sh, REST), said)
 
 
 _ELEVEN = [(21, 11), (11, 10), (0, 11)]
@@ -229,8 +259,8 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     write_bytes(path, rows[order].tobytes())
 
 
-def read_splat(data: bytes) -> Gaussians:
-    """Gaussians of the bytes of a file. Raises: Refused."""
+def read_splat(data: bytes, said: list[str]) -> Gaussians:
+    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused."""
     check_limit("gaussians", len(data) // ROW_BYTES, "Gaussians")
     if not data or len(data) % ROW_BYTES:
         raise Refused(f"no .splat file: expected {ROW_BYTES} bytes for each Gaussian, got {len(data):,}")
@@ -243,119 +273,20 @@ def read_splat(data: bytes) -> Gaussians:
         "opacity": rgba[:, 3],
         "color": rgba[:, :3],
     }
-    return loaded(arrays)
-
-
-# `.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): gzip of a header and six arrays, 20 bytes a Gaussian and 3
-# for each harmonic. Positions in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k / 16 - 10)
-# metres, quaternions by their three smallest components in 10 bits each (version 3, which is written) or by x, y, z in a byte
-# each (version 2), harmonics k / 128 - 1, the channels of each together. Libraries that write it bring a compiler (gsply) or do
-# not install (PyPI's spz).
-
-
-SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3
-HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, number of Gaussians, degree, fractional bits, flags, nothing."""
-MORE_BEHIND = 2
-"""The flag of files with parts that are not read here."""
-MOST_FRACTIONAL_BITS = 20
-"""Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
-COLOR_SCALE, SCALE_STEPS, SCALE_ZERO, HARMONIC_STEPS = 0.15, 16.0, 10.0, 128.0
-QUATERNION_STEPS = 511
-
-
-def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.spz`; the file appears whole or not at all.
-
-    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to 10. Harmonics are from -1 to 1.
-
-    Raises: ValueError for Gaussians farther than 8,000 km from the origin.
-    """
-    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
-    farthest = np.abs(means).max(initial=1e-6)
-    bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
-    if bits < 0:
-        raise ValueError(f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}")
-    fixed = np.rint(means * 2.0**bits).astype("<i4")
-    with np.errstate(divide="ignore"):
-        steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
-    parts = (
-        fixed[..., None].view("u1")[..., :3],  # the lower three of four bytes
-        _byte(255 * opacities),
-        _byte(255 * (COLOR_SCALE * sh_of(colors) + 0.5)),
-        _byte(steps),
-        _packed_quaternions(quats),
-        _byte(HARMONIC_STEPS * harmonics + HARMONIC_STEPS),
-    )
-    header = HEADER.pack(SPZ_MAGIC, SPZ_VERSION, len(means), COUNTS.index(harmonics.shape[1]), bits, 0, 0)
-    data = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-    write_bytes(path, gzip.compress(data, 9, mtime=0))
-
-
-def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
-    return np.clip(np.rint(values), 0, 255).astype("u1")
-
-
-def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
-    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.argmax(np.abs(xyzw), axis=1)
-    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
-    sizes = np.clip(np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS).astype("<u4")
-    packed = largest.astype("<u4")
-    for i in range(4):
-        component = packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
-        packed = np.where(largest == i, packed, component).astype("<u4")
-    return packed
-
-
-def read_spz(data: bytes) -> Gaussians:
-    """Gaussians of the bytes of a file. Raises: Refused; what gzip raises for damaged files."""
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-        header = file.read(HEADER.size).ljust(HEADER.size, b"\0")
-        magic, version, count, degree, bits, flags, _ = HEADER.unpack(header)
-        if magic != SPZ_MAGIC or version not in (2, SPZ_VERSION) or degree >= len(COUNTS):
-            raise Refused(f"expected .spz of version 2 or 3 and degree 0 to 3, got version {version} and degree {degree}")
-        check_limit("gaussians", count, "Gaussians")
-        widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * COUNTS[degree])
-        check_unpacked(len(data), size := count * sum(widths))
-        content = file.read(size + 1)
-    if len(content) < size or (len(content) > size and not flags & MORE_BEHIND):
-        raise Refused(f"expected {count:,} Gaussians in {size:,} bytes, got {'more' if len(content) > size else 'less'}")
-    starts = itertools.accumulate(widths, initial=0)
-    parts = [
-        np.frombuffer(content, "u1", count * width, count * start).reshape(count, width)
-        for start, width in zip(starts, widths, strict=False)
-    ]
-    positions, opacities, colors, scales, quats, harmonics = parts
-    padded = np.pad(positions.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))  # the lowest of four bytes
-    arrays = {
-        "positions": np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits),
-        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count)) if version == 2 else _smallest_three(quats),
-        "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
-        "alphas": opacities[:, 0] / 255,
-        "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
-        "sh": harmonics.reshape(count, COUNTS[degree], 3) / np.float32(HARMONIC_STEPS) - 1,
-    }
-    return loaded(arrays if degree else {name: arrays[name] for name in list(arrays)[:5]})
-
-
-def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """Inverse of `_packed_quaternions`."""
-    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
-    signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
-    three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)
-    return with_largest(three / (QUATERNION_STEPS * np.sqrt(2)), word >> 30)[:, [3, 0, 1, 2]]
+    return loaded(arrays, said)
 
 
 # `.glb`: glTF 2.0 with KHR_gaussian_splatting
 # (https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting): quaternions xyzw, linear scales.
 
 
-logger = logging.getLogger(__name__)
-
 EXTENSION, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
 COEFFICIENTS = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for degree in (1, 2, 3) for i in range(2 * degree + 1)]
+KERNEL = "ellipse"
+"""The usual shape of a Gaussian, and the only one that is drawn."""
+NEEDED = tuple(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))
+ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
+"""Those of the extension."""
 
 
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -379,7 +310,7 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     attributes = {
         name: writer.array(kind, values, VERTICES, bounds=name == "POSITION") for name, (kind, values) in arrays.items()
     }
-    about = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
+    about = {"kernel": KERNEL, "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     document = {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
@@ -390,8 +321,11 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     writer.write(path, document)
 
 
-def read_glb(data: bytes) -> Gaussians:
-    """Gaussians of the bytes of a file, those of all nodes in their places. Raises: Refused; what damaged numbers raise."""
+def read_glb(data: bytes, said: list[str]) -> Gaussians:
+    """Gaussians of the bytes of a file, those of all nodes in their places. said: takes lines.
+
+    Raises: Refused; what damaged numbers raise.
+    """
     content, binary = parse_glb(data)
     if needed := sorted(set(content.get("extensionsRequired", [])) - {EXTENSION, "KHR_mesh_quantization"}):
         raise Refused(f"needs the extension {shown(needed[0])}: expected {EXTENSION} without compression")
@@ -409,27 +343,38 @@ def read_glb(data: bytes) -> Gaussians:
     check_limit("gaussians", sum(counts), "Gaussians")
     spaces = {shown(part["extensions"][EXTENSION].get("colorSpace", SRGB)) for part, _ in placed}
     if spaces != {shown(SRGB)}:
-        logger.warning("colors of %s are taken as they are: images of them have these colors, too", ", ".join(spaces))
-    parts = [_part(content, binary, part["attributes"], place) for part, place in placed]
+        said.append(f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have these colors, too")
+    said += _other_parts(placed)
+    parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]
     if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
         raise Refused("parts with harmonics of different degrees: expected one degree")
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
 
 
-def _part(content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"]) -> Gaussians:
+def _other_parts(placed: Sequence[tuple[dict[str, Any], Any]]) -> list[str]:
+    """What is to be said of kernels and attributes of the extension that have no meaning here."""
+    kernels = {shown(part["extensions"][EXTENSION].get("kernel", KERNEL)) for part, _ in placed} - {shown(KERNEL)}
+    names = {name for part, _ in placed for name in part["attributes"] if name.startswith(EXTENSION)} - set(ATTRIBUTES)
+    found = [f"kernel {kernel}" for kernel in sorted(kernels)] + [shown(name) for name in sorted(names)]
+    return [f"parts that are not used: {', '.join(found[:SHOWN])}"] if found else []
+
+
+def _part(
+    content: dict[str, Any], binary: bytes, attributes: dict[str, int], place: Float[np.ndarray, "4 4"], said: list[str]
+) -> Gaussians:
     def array(name: str) -> np.ndarray:
         if name not in attributes:
             raise Refused(f"{name}: missing")
         return read_accessor(content, binary, attributes[name])
 
-    names = [f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0")]
-    arrays = {name: array(name) for name in ("POSITION", *names)}
-    arrays[names[0]] = np.roll(arrays[names[0]], 1, axis=1)
-    arrays[names[2]] = arrays[names[2]].reshape(-1)
-    arrays[names[3]] = colors_of(arrays[names[3]])
+    arrays = {name: array(name) for name in ("POSITION", *NEEDED)}
+    turns, _, opacities, colors = NEEDED
+    arrays[turns] = np.roll(arrays[turns], 1, axis=1)
+    arrays[opacities] = arrays[opacities].reshape(-1)
+    arrays[colors] = colors_of(arrays[colors])
     if count := next(count for count in COUNTS[::-1] if not count or COEFFICIENTS[count - 1] in attributes):
         arrays["SH"] = np.stack([array(name) for name in COEFFICIENTS[:count]], axis=1)
-    gaussians = loaded(arrays)
+    gaussians = loaded(arrays, said)
     if np.array_equal(place, np.eye(4)):
         return gaussians
     return factored(skin_gaussians(gaussians, jnp.broadcast_to(jnp.asarray(place, jnp.float32), (len(gaussians.means), 4, 4))))

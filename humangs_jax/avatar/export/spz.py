@@ -1,0 +1,257 @@
+"""`.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): a header and six arrays, 20 bytes a Gaussian and 3 more
+for each harmonic.
+
+Positions are in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k / 16 - 10) metres, harmonics
+k / 128 - 1, the channels of each together. Quaternions have their three smallest components in 10 bits each; before version 3
+x, y, z in a byte each. Version 1 has positions in 16-bit floats.
+
+Up to version 3 all of it is one gzip. Version 4 has a header of 32 bytes that is not compressed, perhaps records of others behind
+it, a table of (bytes, bytes unpacked) at the offset that the header names, and one zstd frame for each array that is not empty.
+
+Libraries that write it bring a compiler (gsply) or do not install (PyPI's spz).
+"""
+
+import gzip
+import io
+import itertools
+import os
+import struct
+import sys
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from humangs_jax.avatar.export.gaussians import colors_of, loaded, plain_arrays, sh_of, with_largest
+from humangs_jax.core.array_types import Float, UInt, UInt8
+from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked
+from humangs_jax.rendering.gaussians import COUNTS, Gaussians
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+Version = Literal[3, 4]
+"""Of the files that are written. More programs read 3."""
+SPZ_MAGIC = 0x5053474E
+"""NGSP."""
+WITH_TABLE = 4
+"""The version from which on the arrays are compressed one by one."""
+HEADER = struct.Struct("<IIIBBBB")
+"""Magic, version, number of Gaussians, degree, fractional bits, flags, number of streams (before version 4 nothing)."""
+TABLE_PLACE = struct.Struct("<I12x")
+"""What version 4 has behind it: where the table begins."""
+TABLE_ROW = struct.Struct("<QQ")
+"""Bytes of a stream, and of what it unpacks to."""
+RECORD = struct.Struct("<II")
+"""How the records of others begin: whose, and how many bytes follow."""
+COORDINATE_SYSTEM = 0xADBE0003
+"""The record of files whose axes are not to the right, up and back."""
+ANTIALIASED = 1
+"""The flag of Gaussians that were trained with the filters of Mip-Splatting."""
+MORE_BEHIND = 2
+"""The flag of files with records of others."""
+MOST_FRACTIONAL_BITS = 20
+"""Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
+COLOR_SCALE, SCALE_STEPS, SCALE_ZERO, HARMONIC_STEPS = 0.15, 16.0, 10.0, 128.0
+QUATERNION_STEPS = 511
+
+
+class _Header(NamedTuple):
+    """What a file says of itself."""
+
+    magic: int
+    version: int
+    count: int
+    degree: int
+    bits: int
+    flags: int
+    streams: int
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions, harmonics."""
+        positions = 6 if self.version == 1 else 9
+        quats = 3 if self.version < 3 else 4
+        return positions, 1, 3, 3, quats, 3 * COUNTS[self.degree]
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Version = 3) -> None:
+    """Write a `.spz`; the file appears whole or not at all.
+
+    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to 10. Harmonics are from -1 to 1.
+
+    Raises: ValueError for Gaussians farther than 8,000 km from the origin.
+    """
+    means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
+    farthest = np.abs(means).max(initial=1e-6)
+    bits = min(MOST_FRACTIONAL_BITS, int(np.floor(np.log2((2**23 - 1) / farthest))))
+    if bits < 0:
+        raise ValueError(f"{path}: .spz holds Gaussians up to 8,388,607 m from the origin, got {farthest:g}")
+    fixed = np.rint(means * 2.0**bits).astype("<i4")
+    with np.errstate(divide="ignore"):
+        steps = SCALE_STEPS * (np.log(scales) + SCALE_ZERO)
+    arrays = (
+        fixed[..., None].view("u1")[..., :3],  # the lower three of four bytes
+        _byte(255 * opacities),
+        _byte(255 * (COLOR_SCALE * sh_of(colors) + 0.5)),
+        _byte(steps),
+        _packed_quaternions(quats),
+        _byte(HARMONIC_STEPS * harmonics + HARMONIC_STEPS),
+    )
+    parts = [np.ascontiguousarray(array).tobytes() for array in arrays]
+    numbers = (SPZ_MAGIC, version, len(means), COUNTS.index(harmonics.shape[1]), bits, 0)
+    if version < WITH_TABLE:
+        content = HEADER.pack(*numbers, 0) + b"".join(parts)
+        write_bytes(path, gzip.compress(content, 9, mtime=0))
+        return
+    parts = [part for part in parts if part]
+    streams = [zstd.compress(part, 12) for part in parts]
+    table = [TABLE_ROW.pack(len(stream), len(part)) for stream, part in zip(streams, parts, strict=True)]
+    begin = HEADER.pack(*numbers, len(streams)) + TABLE_PLACE.pack(HEADER.size + TABLE_PLACE.size)
+    write_bytes(path, begin + b"".join(table) + b"".join(streams))
+
+
+def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
+    return np.clip(np.rint(values), 0, 255).astype("u1")
+
+
+def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
+    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a size out of 1 / sqrt(2)."""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest = np.argmax(np.abs(xyzw), axis=1)
+    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
+    sizes = np.clip(np.floor(QUATERNION_STEPS * np.sqrt(2) * np.abs(xyzw) + 0.5), 0, QUATERNION_STEPS).astype("<u4")
+    packed = largest.astype("<u4")
+    for i in range(4):
+        component = packed << np.uint32(10) | np.where(xyzw[:, i] < 0, 512, 0).astype("<u4") | sizes[:, i]
+        packed = np.where(largest == i, packed, component).astype("<u4")
+    return packed
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def read_spz(data: bytes, said: list[str]) -> Gaussians:
+    """Gaussians of the bytes of a file. said: takes lines. Raises: Refused; what gzip and zstd raise for damaged files."""
+    header, parts = _with_table(data, said) if data.startswith(b"NGSP") else _of_gzip(data)
+    if header.flags & ANTIALIASED:
+        said.append("trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from afar")
+    if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
+        said.append("records of other programs at its end are not used")
+    count, version = header.count, header.version
+    positions, opacities, colors, scales, quats, harmonics = (
+        np.frombuffer(part, "u1").reshape(count, width) for part, width in zip(parts, header.widths, strict=True)
+    )
+    arrays = {
+        "positions": positions.view("<f2") if version == 1 else _fixed_point(positions, header.bits),
+        "rotations": with_largest(quats / 127.5 - 1, np.zeros(count)) if version < 3 else _smallest_three(quats),
+        "scales": np.exp(scales / SCALE_STEPS - SCALE_ZERO),
+        "alphas": opacities[:, 0] / 255,
+        "colors": colors_of((colors / 255 - 0.5) / COLOR_SCALE),
+    }
+    if header.degree:
+        arrays["sh"] = harmonics.reshape(count, COUNTS[header.degree], 3) / np.float32(HARMONIC_STEPS) - 1
+    return loaded(arrays, said)
+
+
+def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
+    """The header at the start of a file of that many bytes, if it may unpack to what it says. Raises: Refused."""
+    header = _Header(*HEADER.unpack(start[: HEADER.size].ljust(HEADER.size, b"\0")))
+    if header.magic != SPZ_MAGIC or header.version not in versions:
+        raise Refused(f"no .spz of version 1 to 4: version {header.version} in what begins as version {versions[-1]} does")
+    if header.degree >= len(COUNTS):
+        raise Refused(f"harmonics of degree {header.degree}: expected .spz of degree 0 to 3")
+    check_limit("gaussians", header.count, "Gaussians")
+    check_unpacked(size, header.count * sum(header.widths))
+    return header
+
+
+def _of_gzip(data: bytes) -> tuple[_Header, list[bytes]]:
+    """The header and the six arrays of a file of version 1 to 3."""
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        header = _checked_header(file.read(HEADER.size), (1, 2, 3), len(data))
+        sizes = [header.count * width for width in header.widths]
+        content = file.read(sum(sizes) + 1)
+    _check_size(len(content), header, more=bool(header.flags & MORE_BEHIND))
+    ends = list(itertools.accumulate(sizes))
+    return header, [content[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+
+
+def _check_size(size: int, header: _Header, more: bool = False) -> None:
+    expected = header.count * sum(header.widths)
+    if size < expected or (size > expected and not more):
+        raise Refused(f"expected {header.count:,} Gaussians in {expected:,} bytes, got {'more' if size > expected else 'less'}")
+
+
+def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
+    """The header and the six arrays of a file of version 4. What the table says must fit the file and the number of Gaussians
+    before anything is unpacked, so nothing becomes larger than it may.
+    """
+    header = _checked_header(data, (WITH_TABLE,), len(data))
+    begin = HEADER.size + TABLE_PLACE.size
+    if len(data) < begin:
+        raise Refused(f"cut short: expected a header of {begin} bytes, got {len(data)}")
+    (place,) = TABLE_PLACE.unpack_from(data, HEADER.size)
+    end = place + header.streams * TABLE_ROW.size
+    if not begin <= place <= end <= len(data):
+        raise Refused(f"table of {header.streams} streams at {place:,}: expected it within {len(data):,} bytes")
+    said += _records(data[begin:place])
+    rows = list(TABLE_ROW.iter_unpack(data[place:end]))
+    sizes = [header.count * width for width in header.widths]
+    filled = [size for size in sizes if size]
+    rows = rows if len(rows) == len(filled) else [row for row in rows if row[1]]  # empty streams may be left out
+    if [unpacked for _, unpacked in rows] != filled:
+        found = ", ".join(f"{unpacked:,}" for _, unpacked in rows[: len(sizes)]) or "none"
+        wanted = ", ".join(f"{size:,}" for size in filled)
+        raise Refused(f"table: {header.count:,} Gaussians: expected streams of {wanted} bytes, got {found}")
+    streams = []
+    at = end
+    for packed, unpacked in TABLE_ROW.iter_unpack(data[place:end]):
+        if packed > len(data) - at:
+            raise Refused(f"cut short: a stream of {packed:,} bytes from {at:,}, but there are {len(data):,}")
+        if unpacked:
+            streams.append(_unpacked(data[at : at + packed], unpacked))
+        at += packed
+    waiting = iter(streams)
+    return header, [next(waiting) if size else b"" for size in sizes]
+
+
+def _records(data: bytes) -> list[str]:
+    """What is to be said of the records of other programs."""
+    names, at = [], 0
+    while at + RECORD.size <= len(data):
+        kind, size = RECORD.unpack_from(data, at)
+        if kind == COORDINATE_SYSTEM:
+            names.append("the coordinate system: turn the Gaussians yourself")
+        else:
+            names.append(f"{kind:#010x}")
+        at += RECORD.size + size
+    return [f"records of other programs that are not used: {', '.join(names[:4])}"] if names else []
+
+
+def _unpacked(stream: bytes, size: int) -> bytes:
+    """That many bytes, of a zstd frame. Raises: Refused for another number; ZstdError."""
+    content = zstd.ZstdDecompressor().decompress(stream, size + 1)
+    if len(content) != size:
+        raise Refused(f"a stream unpacks to {'more' if len(content) > size else 'less'} than the {size:,} bytes of the table")
+    return content
+
+
+def _fixed_point(positions: UInt8[np.ndarray, "g 9"], bits: int) -> Float[np.ndarray, "g 3"]:
+    """Numbers of three bytes each, which are the upper three of four."""
+    padded = np.pad(positions.reshape(len(positions), 3, 3), ((0, 0), (0, 0), (1, 0)))
+    return np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits)
+
+
+def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
+    """Inverse of `_packed_quaternions`."""
+    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
+    three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)
+    return with_largest(three / (QUATERNION_STEPS * np.sqrt(2)), word >> 30)[:, [3, 0, 1, 2]]
