@@ -14,7 +14,7 @@ import numpy as np
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.body_and_masks import usable_views
-from humangs_jax.data.calibration.photos import SUFFIXES, is_photo, is_transparent
+from humangs_jax.data.calibration.photos import PHOTO_SUFFIXES, is_photo, is_transparent
 from humangs_jax.data.calibration.videos import (
     LONGER_SIDE,
     PHOTOS,
@@ -122,7 +122,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     images = next((place for name in PHOTO_FOLDERS if any(find_photos(place := folder / name))), folder)
     photos = sorted(find_photos(images))
     if not photos:
-        raise CaptureError(folder, "", f"no photo: expected {', '.join(SUFFIXES[:4])} files in it or in {folder / 'images'}")
+        raise CaptureError(folder, "", f"no photo: expected {', '.join(PHOTO_SUFFIXES)} files in it or in {folder / 'images'}")
     return images, photos
 
 

@@ -1,4 +1,4 @@
-"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
+"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF, values as stored, no gamma.
 
 With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content decides, not the name: no other format is
 looked at. Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF): `orientation` reads
@@ -19,20 +19,23 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.image_headers import JPEG_START, is_webp, iso_kind, jpeg_scans, webp_size
 from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
 
 FORMATS = ("PNG", "JPEG")
-"""Pillow knows some forty more, one of which starts Ghostscript."""
-HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
-"""Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
+"""Of textures. Pillow knows some forty more, one of which starts Ghostscript."""
+NAMES = {"HEIF": "HEIC", "AVIF": "AVIF", "WEBP": "WebP"}
+"""Of Pillow's formats, as people write them."""
+HEAD = 256
+"""Bytes of a file that tell its format."""
 GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
 ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
-EXIF_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
-"""A file without any of these has no EXIF; looking further would decode a PNG."""
+EXIF_MARKS = (b"Exif", b"eXIf", b"EXIF", b"ftypavi", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
+"""A file without any of these has no EXIF; looking further would decode a PNG. An AVIF may be turned without it."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
 """Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
@@ -235,27 +238,32 @@ def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
     """
     with reading(path, "image"):
         data = read_bytes(path, "image_bytes")
-        with image_in(data, _heic_formats() if _begins_heic(data) else FORMATS) as image:
+        with image_in(data, _formats(data)) as image:
             yield image, data
 
 
 def is_heic(path: str | Path) -> bool:
     """Whether a file begins as a HEIC photo. Raises: FileNotFoundError; FileError."""
     with reading(path, "image"), open_file(path, "image_bytes") as file:
-        return _begins_heic(file.read(12))
+        return iso_kind(file.read(HEAD)) == "HEIF"
 
 
-def _begins_heic(data: bytes) -> bool:
-    return data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS
+def _formats(data: bytes) -> tuple[str, ...]:
+    """The formats of Pillow, which knows them from now on, that a file with these bytes may have. Raises: Refused."""
+    kind = iso_kind(data)
+    if kind == "HEIF":
+        try:
+            importlib.import_module("pi_heif").register_heif_opener()
+        except ImportError:
+            raise Refused('a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"') from None
+    elif kind == "AVIF":
+        from PIL import features
 
-
-def _heic_formats() -> tuple[str, ...]:
-    """Formats for Pillow, which knows this one from now on. Raises: Refused without the extra."""
-    try:
-        importlib.import_module("pi_heif").register_heif_opener()
-    except ImportError:
-        raise Refused('a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"') from None
-    return ("HEIF",)
+        if not features.check("avif"):
+            raise Refused("an AVIF photo, which this Pillow cannot read: expected PNG or JPEG, or pip install -U Pillow")
+    elif is_webp(data):
+        kind = "WEBP"
+    return FORMATS if kind is None else (kind,)
 
 
 @contextlib.contextmanager
@@ -266,15 +274,22 @@ def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
     """
     from PIL import Image
 
-    if data[:2] == b"\xff\xd8":  # each scan may cost as much as all the pixels
-        check_limit("scans", data.count(b"\xff\xda"), "scans of a JPEG")
+    if data[:2] == JPEG_START:  # each scan may cost as much as all the pixels
+        check_limit("scans", jpeg_scans(data), "scans of a JPEG")
+    if formats == ("WEBP",):  # which takes memory for all the pixels when it is opened
+        _check_size(*webp_size(data))
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
-            check_limit("pixels", image.width * image.height, f"pixels ({image.width} x {image.height})")
-            check_limit("side", max(image.size), "pixels along a side")
+            _check_size(*image.size)
             yield image
     except Image.UnidentifiedImageError as error:
-        raise ValueError("damaged HEIC" if formats != FORMATS else f"neither {' nor '.join(FORMATS)}") from error
+        wrong = f"neither {' nor '.join(FORMATS)}" if formats == FORMATS else f"damaged {NAMES[formats[0]]}"
+        raise ValueError(wrong) from error
+
+
+def _check_size(width: int, height: int) -> None:
+    check_limit("pixels", width * height, f"pixels ({width} x {height})")
+    check_limit("side", max(width, height), "pixels along a side")
 
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:

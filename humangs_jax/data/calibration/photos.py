@@ -19,7 +19,8 @@ from humangs_jax.data.capture_checks import CaptureError, checked_path, counted,
 from humangs_jax.data.photos import read_checked, read_mask
 from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
 
-SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
+SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
 """File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
