@@ -3,6 +3,8 @@
 A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. No lens distortion.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,21 +49,23 @@ class Camera(Batchable):
     def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
         """A camera from array-likes (3, 3) and (4, 4), checked. Under `jit`, `vmap` and `grad` only shapes are.
 
+        Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have it.
+
         Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
-        orthonormal and right-handed (to 1e-3), or the image empty.
+        orthonormal and right-handed (to 1e-3), the image empty, or its sides no whole numbers.
         """
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
         array = jnp.asarray if traced else np.asarray
-        with np.errstate(over="ignore"):  # what becomes inf is refused below
-            K, cam_from_world = array(K, jnp.float32), array(cam_from_world, jnp.float32)
+        K, cam_from_world = array(K), array(cam_from_world)
+        kept = jnp.promote_types(jnp.result_type(K, cam_from_world), jnp.float32)  # float64 only if JAX has it
         if K.shape != (3, 3):
             raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
         if cam_from_world.shape != (4, 4):
             raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
-        if width < 1 or height < 1:
-            raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+        width, height = _pixels(width, height)
         if traced:
-            return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
+            return cls(K.astype(kept), cam_from_world.astype(kept), width, height)
+        K, cam_from_world = K.astype(np.float64), cam_from_world.astype(np.float64)
         for name, values in (("K", K), ("cam_from_world", cam_from_world)):
             if not np.abs(values).max() <= LARGEST_NUMBER:  # nor NaN
                 raise ValueError(f"{name} must be finite numbers, at most {LARGEST_NUMBER:g} in magnitude")
@@ -74,7 +78,7 @@ class Camera(Batchable):
             raise ValueError("cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)")
         if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
             raise ValueError(f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}")
-        return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
+        return cls(jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept), width, height)
 
     @property
     def world_from_cam(self) -> Float[Array, "*b 4 4"]:
@@ -87,14 +91,24 @@ class Camera(Batchable):
         return self.world_from_cam[..., :3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera for the image resampled to another size."""
+        """The same camera for the image resampled to another size. Raises: ValueError for sides that are no whole numbers."""
+        width, height = _pixels(width, height)
         scale = jnp.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
-        return replace(self, K=self.K * scale[:, None], width=int(width), height=int(height))
+        return replace(self, K=self.K * scale[:, None], width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
         """The same camera for a world whose lengths are divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
         return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
+
+
+def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
+    """The sides of an image as integers. Raises: ValueError for an empty image and for parts of pixels."""
+    if not (width >= 1 and height >= 1):
+        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+    if width % 1 or height % 1 or math.inf in (width, height):
+        raise ValueError(f"width and height: expected whole numbers of pixels, got {width} x {height}")
+    return int(width), int(height)
 
 
 def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values]]:
@@ -140,7 +154,7 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
         )
     tan = jnp.tan if isinstance(vertical_fov, Tracer) else np.tan
     focal = 0.5 * height / tan(0.5 * vertical_fov)
-    return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
+    return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
 
 
 @checked_arguments
@@ -199,6 +213,7 @@ def orbit(
         >>> cameras = hg.orbit(jnp.array([0.0, 0.9, 0.0]), 3.0, jnp.linspace(0, 2 * jnp.pi, 8), 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
+    azimuths = azimuths.astype(jnp.promote_types(azimuths.dtype, jnp.float32))  # integers, too, are radians
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):
         raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
     distance, elevations = (jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations))

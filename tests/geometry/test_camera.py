@@ -76,12 +76,39 @@ def test_from_opencv_is_traced_and_differentiated():
         (dict(cam_from_world=np.diag([-1, 1, 1, 1.0])), "mirrored"),
         (dict(cam_from_world=2 * np.eye(4)), "scaled"),
         (dict(width=0), "at least 1"),
+        (dict(K=K * 1e300), "at most 1e\\+07"),
     ],
 )
 def test_bad_cameras_are_refused_by_name(change, message):
     arguments = dict(K=K, cam_from_world=np.eye(4), width=32, height=24) | change
     with pytest.raises(ValueError, match=message):
         Camera.from_opencv(**arguments)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, jnp.asarray, np.ndarray.tolist])
+def test_a_camera_keeps_float64_where_jax_has_it(kind):
+    focal = 100.0 + 1e-9
+    intrinsics, matrix = np.diag([focal, focal, 1.0]), np.eye(4)
+    with jax.enable_x64(True):
+        made = Camera.from_opencv(kind(intrinsics), kind(matrix), 32, 24)
+        assert made.K.dtype == made.cam_from_world.dtype == jnp.float64 and made.K[0, 0] == focal
+        traced = jax.jit(lambda K: Camera.from_opencv(K, matrix, 32, 24).K)(jnp.asarray(intrinsics))
+        assert traced.dtype == jnp.float64 and traced[0, 0] == focal
+        assert Camera.from_opencv(intrinsics.astype(np.float32), matrix.astype(np.float32), 32, 24).K.dtype == jnp.float32
+        assert cameras.intrinsics_from_fov(np.float64(0.7), 64, 48)[1, 1] == 24 / np.tan(0.35)
+        around = cameras.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 0.1, made.K, 32, 24)
+        assert around.cam_from_world.dtype == around.K.dtype == jnp.float64
+    for single in (Camera.from_opencv(intrinsics, matrix, 32, 24), Camera.from_opencv(K.astype(np.float16), matrix, 32, 24)):
+        assert single.K.dtype == single.cam_from_world.dtype == jnp.float32
+
+
+def test_sides_are_whole_numbers_of_pixels():
+    """Asked of the check itself: types are checked before it in tests."""
+    sides = cameras._pixels(64.0, np.int64(48).item())
+    assert sides == (64, 48) and all(type(side) is int for side in sides)
+    for wrong in ((32.5, 24), (32, 24.5), (float("nan"), 24), (32, float("inf"))):
+        with pytest.raises((ValueError, OverflowError), match=r"whole numbers of pixels, got|at least 1"):
+            cameras._pixels(*wrong)
 
 
 def test_stacking_needs_cameras_of_one_size():
