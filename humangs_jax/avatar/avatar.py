@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, Values
+from humangs_jax.core.checks import FINITE, LARGEST, ROUNDING, Values, require_concrete
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
 from humangs_jax.geometry.transform import EXACT, along_curve
@@ -211,6 +211,7 @@ class Avatar(Batchable):
         those of a pose are: avatars are in the T-pose; FileError if
         `load` would refuse the file, as it does numbers that are not finite.
         """
+        require_concrete("Avatar.save", "writes a file", self)
         if self.batch_shape:
             raise ValueError(f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)")
         if fault := shape_fault(self):

@@ -10,16 +10,20 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.export import VIDEOS, VideoFormat
-from humangs_jax.core.array_types import Float
-from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.array_types import Float, UInt8
+from humangs_jax.core.checks import ROUNDING, checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.registry import alternatives
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import to_uint8, write_png
 
+Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
+CHANNELS = (3, 4)
+"""Of a frame: colors, or colors and alpha."""
 CONSTANT_RATE_FACTOR = 17
 """x264's quality; 18 counts as visually lossless."""
 VP9_QUALITY = 18
@@ -57,7 +61,9 @@ def check_video(path: str | Path, frames: int, width: int, height: int, transpar
 
 @checked_arguments
 def write_video(
-    path: str | Path, frames: Float[np.ndarray, "m h w c"] | Iterable[Float[np.ndarray, "h w c"]], fps: float | int
+    path: str | Path,
+    frames: Float[np.ndarray, "m h w c"] | UInt8[np.ndarray, "m h w c"] | Iterable[Frame],
+    fps: float | int,
 ) -> int:
     """Write frames as a video or as PNG files; all appears at the end, or nothing does.
 
@@ -68,15 +74,16 @@ def write_video(
     Args:
         path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which replace those that are
             there.
-        frames: (h, w, 3) in [0, 1], or with straight alpha (h, w, 4), which only .webm and PNG files have.
+        frames: (h, w, 3) in [0, 1], or with straight alpha (h, w, 4), which only .webm and PNG files have. Frames of uint8,
+            as other programs give them, are from 0 to 255.
         fps: frames per second.
 
     Returns:
         The number of frames.
 
     Raises:
-        ValueError: if there is no frame, they differ in size, a number is not finite, `fps` is not positive, or the suffix
-            is another one or has no alpha.
+        ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold integers other than uint8,
+            `fps` is not positive, or the suffix is another one or has no alpha.
         OSError: if the file cannot be written; also what `frames` raises.
 
     Examples:
@@ -103,23 +110,49 @@ def write_video(
     return next(count)
 
 
+def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
+    """Width and height of the video that frames of this size become: formats with `even_sides` make odd ones longer."""
+    suffix = Path(path).suffix.lower()
+    even = any(form.even_sides for form in VIDEOS.values() if suffix in form.suffixes)
+    return (width + width % 2, height + height % 2) if even else (width, height)
+
+
 def write_images(folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
     """PNG files of all frames."""
     for i, frame in enumerate(frames):
         write_png(folder / f"frame_{i:05d}.png", frame)
 
 
-def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
+    """The frames as arrays, each after its check. Raises: ValueError that names the frame."""
     shape = None
-    for i, frame in enumerate(frames):
+    for i, given in enumerate(frames):
+        frame = np.asarray(given)
+        if frame.ndim != 3 or frame.shape[-1] not in CHANNELS:
+            raise ValueError(f"{path}: frame {i}: expected shape (h, w, 3) or (h, w, 4), got {frame.shape}")
         shape = frame.shape if shape is None else shape
         if 0 in frame.shape:
             raise ValueError(f"{path}: expected at least one frame of at least one pixel, got {frame.shape[:2]}")
         if frame.shape != shape:
             raise ValueError(f"{path}: frame {i} has shape {frame.shape}, expected that of the first, {shape}")
-        if not np.isfinite(frame).all():
-            raise ValueError(f"{path}: frame {i} has numbers that are not finite")
+        _check_numbers(f"{path}: frame {i}", frame)
         yield frame
+
+
+def _check_numbers(name: str, frame: np.ndarray) -> None:
+    """Raises: ValueError for numbers that are no colors."""
+    if frame.dtype == np.uint8:
+        return
+    if not jnp.issubdtype(frame.dtype, jnp.floating):  # numpy's own does not know bfloat16
+        raise ValueError(f"{name}: expected floating-point numbers in [0, 1], or uint8, got {frame.dtype}")
+    low, high = float(frame.min()), float(frame.max())  # NaN if any number is
+    if not np.isfinite([low, high]).all():
+        raise ValueError(f"{name} has numbers that are not finite")
+    if low < -ROUNDING or high > 1 + ROUNDING:
+        raise ValueError(
+            f"{name}: expected numbers in [0, 1], or uint8, got {low:g} to {high:g}: divide those of 0 to 255 by 255, "
+            "np.clip others"
+        )
 
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
@@ -144,7 +177,7 @@ def _write_by_ffmpeg(path: Path, frames: Iterable[np.ndarray], fps: float, shape
     import imageio_ffmpeg
 
     height, width, channels = shape
-    odd = ((0, height % 2), (0, width % 2), (0, 0))
+    odd = ((0, height % 2), (0, width % 2), (0, 0))  # as `video_size` says
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgba" if channels == 4 else "rgb24"]
     command += ["-s", f"{width + width % 2}x{height + height % 2}"]

@@ -83,7 +83,7 @@ class Animate:
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             written = write_video(self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps)
-        wrote(self.out, f"{written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
+        wrote(self.out, f"{written} frames of {_size(self.shot, self.out)} at {motion.fps:g} frames per second")
         suggest("humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion))
 
 
@@ -159,7 +159,7 @@ class Render:
         with stage("drawing"):
             if video:
                 written = write_video(self.out, images(avatar, poses, cameras, shot, "render"), self.fps)
-                what = f"{written} frames of {_size(self.shot)} at {self.fps:g} frames per second"
+                what = f"{written} frames of {_size(self.shot, self.out)} at {self.fps:g} frames per second"
             else:
                 exr = layers if self.exr else None
                 written = write_views(self.out, avatar, poses, cameras, shot, exr, exposures=exposed)
@@ -189,7 +189,7 @@ class Render:
         with stage("drawing"):
             if self.out.suffix:
                 count = write_video(self.out, splat_images(gaussians, cameras, shot), self.fps)
-                what = f"{count} frames of {_size(self.shot)} at {self.fps:g} frames per second"
+                what = f"{count} frames of {_size(self.shot, self.out)} at {self.fps:g} frames per second"
             else:
                 what = f"{write_splat_views(self.out, gaussians, cameras, shot)} views"
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
@@ -266,6 +266,9 @@ def _pruned(avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: Shot) 
     return seen
 
 
-def _size(shot: Shot) -> str:
-    width, height = shot.resolution
+def _size(shot: Shot, path: Path) -> str:
+    """The size of the file, which may have another row or column than what is drawn."""
+    from humangs_jax.avatar.video import video_size
+
+    width, height = video_size(path, *shot.resolution)
     return f"{width} x {height}"

@@ -194,6 +194,12 @@ def check_values(
             raise ValueError(f"{owner}: {name}: {_fault(np.asarray(array, np.float64), values)}")
 
 
+def require_concrete(owner: str, why: str, *trees: Any) -> None:
+    """Raises: TypeError, one line, where arrays are traced. owner: the function that was called. why: it needs their values."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)):
+        raise TypeError(f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only")
+
+
 @jax.jit
 def _extremes(arrays: tuple[Array, ...]) -> Array:
     """(arrays, 2): least and largest entry of each; both NaN if an entry is."""

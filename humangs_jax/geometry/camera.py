@@ -64,7 +64,7 @@ class Camera(Batchable):
             raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
         width, height = _pixels(width, height)
         if traced:
-            return cls(K.astype(kept), cam_from_world.astype(kept), width, height)
+            return cls(jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept), width, height)
         K, cam_from_world = K.astype(np.float64), cam_from_world.astype(np.float64)
         for name, values in (("K", K), ("cam_from_world", cam_from_world)):
             if not np.abs(values).max() <= LARGEST_NUMBER:  # nor NaN

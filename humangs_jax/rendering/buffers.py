@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Int
-from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.checks import checked_arguments, require_concrete
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
@@ -78,9 +78,13 @@ def plan_buffers(
     Returns:
         `config` with `max_pairs` and `max_rows`.
 
+    Raises:
+        TypeError: inside of `jit`, `vmap` and `grad`.
+
     Examples:
         >>> config = hg.plan_buffers(gaussians, cameras, margin=2.0)
     """
+    require_concrete("plan_buffers", "measures what a scene needs", gaussians, cameras)
     config = splat_config(config)
     rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config))
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)

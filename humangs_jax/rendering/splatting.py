@@ -1,7 +1,8 @@
-"""Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad`.
+"""Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad` (reverse mode, first
+derivatives).
 
 Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background. `reference` draws the same
-image by the definition. Gradients (reverse mode only) reach means, quats, scales, opacities, colors, harmonics, deformations, the
+image by the definition. Gradients reach means, quats, scales, opacities, colors, harmonics, deformations, the
 background, and K and cam_from_world of the camera.
 
 Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of transformations measures
@@ -88,7 +89,9 @@ def render(
     background: Background = None,
     features: Float[Array, "g n"] | None = None,
 ) -> Rendering:
-    """Draw Gaussians as one camera sees them. After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
+    """Draw Gaussians as one camera sees them. Gradients are of reverse mode, first derivatives: no `jvp`, no Hessian.
+
+    After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
     Called directly, arguments are checked and buffers sized to the scene. Inside `jit`, `vmap` and `grad` values are not
     checked, and buffers come from `config`: `plan_buffers` sizes them once. Pairs of splats and tiles that do not fit are not

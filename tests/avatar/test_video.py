@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.avatar import video
-from humangs_jax.avatar.video import check_video, write_video
+from humangs_jax.avatar.video import check_video, video_size, write_video
 from humangs_jax.io.images import read_image
 
 H264_ERROR = 0.02
@@ -66,6 +66,50 @@ def test_webm_and_png_files_are_transparent(tmp_path):
     for i, frame in enumerate(frames):
         image, its_alpha = read_image(tmp_path / "frames" / f"frame_{i:05d}.png")
         np.testing.assert_allclose(np.concatenate([image, its_alpha[..., None]], -1), frame, atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
+def test_frames_of_bytes_are_those_of_numbers(tmp_path, name):
+    """Frames of OpenCV, Pillow and imageio are uint8."""
+    frames, data = np.rint(255 * moving_square(3)).astype(np.uint8), []
+    for given in (frames, frames / np.float32(255)):
+        write_video(tmp_path / name, given, 24)
+        data.append([path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()])
+    assert data[0] == data[1]
+
+
+ONE = np.full((4, 6, 3), 0.5, np.float32)
+NO_COLORS = {
+    "numbers up to 200": (np.full((4, 6, 3), 200.0), r"frame 1: expected numbers in \[0, 1\], or uint8, got 200 to 200: divide"),
+    "a little above": (1.01 * np.ones((4, 6, 3)), r"expected numbers in \[0, 1\], or uint8, got 1.01 to 1.01"),
+    "below": (ONE - 1, r"expected numbers in \[0, 1\], or uint8, got -0.5 to -0.5"),
+    "whole numbers": (np.full((4, 6, 3), 200), "frame 1: expected floating-point numbers in .*, or uint8, got int64"),
+    "bits": (np.ones((4, 6, 3), bool), "expected floating-point numbers in .*, got bool"),
+    "a hole": (ONE * np.nan, "frame 1 has numbers that are not finite"),
+    "gray": (ONE[..., 0], r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6\)"),
+    "two channels": (ONE[..., :2], r"frame 1: expected shape \(h, w, 3\) or \(h, w, 4\), got \(4, 6, 2\)"),
+}
+
+
+@pytest.mark.parametrize("name", NO_COLORS)
+def test_numbers_that_are_no_colors_are_refused_and_nothing_is_written(tmp_path, name):
+    frame, words = NO_COLORS[name]
+    with pytest.raises(ValueError, match=words):
+        write_video(tmp_path / "a.mp4", iter([ONE, frame]), 24)
+    assert not list(tmp_path.iterdir())
+
+
+def test_float32_roundings_beside_0_and_1_are_written(tmp_path):
+    write_video(tmp_path / "frames", [ONE * 0 + np.float32(1 + 5e-7), ONE * 0 - np.float32(5e-7)], 24)
+    assert [read_image(tmp_path / "frames" / f"frame_{i:05d}.png")[0].mean() for i in range(2)] == [1, 0]
+
+
+@pytest.mark.parametrize(("name", "size"), [("a.mp4", (64, 48)), ("a.webm", (64, 48)), ("a.gif", (63, 47)), ("a", (63, 47))])
+def test_the_size_that_is_told_is_that_of_the_file(tmp_path, name, size):
+    write_video(tmp_path / name, moving_square(2, 47, 63), 24)
+    file = tmp_path / name / "frame_00000.png" if name == "a" else tmp_path / name
+    assert video_size(file.parent if name == "a" else file, 63, 47) == size
+    assert f"{size[0]}x{size[1]}" in ffmpeg("-i", file).stderr.decode()
 
 
 def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):

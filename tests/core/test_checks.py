@@ -90,6 +90,15 @@ WRONG = {
         lambda: hg.render(replace(GAUSSIANS, means=np.zeros((COUNT, 3)).tolist()), CAMERA),
         r"gaussians.means: expected an array of shape \(g, 3\), got list; jnp.asarray makes one",
     ),
+    "a plan of what is traced": (
+        lambda: jax.jit(lambda g: hg.plan_buffers(g, CAMERA).max_pairs)(GAUSSIANS),
+        "^plan_buffers measures what a scene needs: call it outside of jit, vmap and grad, which know shapes only",
+    ),
+    "a file of what is traced": (
+        lambda: jax.jit(lambda g: hg.save_gaussians("a.ply", g))(GAUSSIANS),
+        "^save_gaussians writes a file: call it outside of jit",
+    ),
+    "an avatar that is traced": (lambda: jax.jit(lambda a: a.save("a.npz"))(AVATAR), "^Avatar.save writes a file: call it outs"),
     "integers in an export": (
         lambda: hg.export("a.ply", replace(AVATAR, rest_vertices=jnp.zeros((4, 3), int))),
         r"avatar.rest_vertices: expected floating-point numbers, got int32",

@@ -87,12 +87,14 @@ class VideoFormat(Format):
 
     transparent: bool = False
     """Its frames may have alpha."""
+    even_sides: bool = False
+    """Its codec wants even sides: odd ones get one more row or column."""
 
 
 _VIDEO = "humangs_jax.avatar.video"
 VIDEOS = Formats(
-    mp4=VideoFormat("H.264, plays everywhere", f"{_VIDEO}:write_mp4", (".mp4",)),
-    webm=VideoFormat("VP9, may be transparent", f"{_VIDEO}:write_webm", (".webm",), transparent=True),
+    mp4=VideoFormat("H.264, plays everywhere", f"{_VIDEO}:write_mp4", (".mp4",), even_sides=True),
+    webm=VideoFormat("VP9, may be transparent", f"{_VIDEO}:write_webm", (".webm",), transparent=True, even_sides=True),
     gif=VideoFormat("256 colors, endless", f"{_VIDEO}:write_gif", (".gif",)),
     images=VideoFormat("frame_00000.png and so on", f"{_VIDEO}:write_images", (FOLDER,), transparent=True),
 )

@@ -22,7 +22,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import EXPORTS, OTHERS, ExportFormat, Up, chosen_format
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.array_types import Float
-from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments
+from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments, require_concrete
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import alternatives, imported
 from humangs_jax.data.motion import Motion, grounded
@@ -181,6 +181,7 @@ def save_gaussians(path: str | os.PathLike[str], gaussians: Gaussians, *, y_up: 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
     """
+    require_concrete("save_gaussians", "writes a file", gaussians)
     form = chosen_format(os.path.splitext(path)[1])
     if form is None or form.mesh:
         raise ValueError(f"{path}: expected a name ending in {_suffixes()}")
@@ -330,6 +331,7 @@ def export(
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)
     """
+    require_concrete("export", "writes a file", avatar, motion)
     path = Path(path)
     form = chosen_format(path.suffix, mesh)
     if form is None:
