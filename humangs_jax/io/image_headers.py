@@ -68,3 +68,26 @@ def iso_kind(data: bytes) -> str | None:
     if data[8:12] in AVIF_BRANDS or (data[8:12] in (b"mif1", b"msf1") and further & AVIF_BRANDS):
         return "AVIF"
     return "HEIF" if data[8:12] in HEIC_BRANDS else None
+
+
+def png_chunks(data: bytes) -> dict[bytes, bytes]:
+    """The chunks of a PNG file before its pixels, by name."""
+    at, found = 8, {}
+    while at + 8 <= len(data) and (name := data[at + 4 : at + 8]) != b"IDAT":
+        length = int.from_bytes(data[at : at + 4], "big")
+        found[name] = data[at + 8 : at + 8 + length]
+        at += 12 + length
+    return found
+
+
+NCLX = b"colrnclx"
+"""A box of HEIC and AVIF files before their code points of colors."""
+
+
+def nclx_colors(data: bytes) -> tuple[int, int] | None:
+    """Code points (H.273) of the primaries and the curve of an AVIF, of the first box that has some."""
+    at = data.find(NCLX)
+    numbers = data[at + len(NCLX) : at + len(NCLX) + 4]
+    if at < 0 or len(numbers) < 4:
+        return None
+    return int.from_bytes(numbers[:2], "big"), int.from_bytes(numbers[2:], "big")

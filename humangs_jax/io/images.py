@@ -1,13 +1,17 @@
-"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF, values as stored, no gamma.
+"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF, in sRGB.
 
+Photos say how their colors are encoded (an ICC profile, or numbers in their header), and colors are converted to sRGB; those of
+files that say nothing, or sRGB, are values as stored. Masks are values as stored, too.
 With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content decides, not the name: no other format is
 looked at. Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF): `orientation` reads
 it, `oriented` obeys it, and who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
 """
 
 import contextlib
+import functools
 import importlib
 import io
+import logging
 import struct
 import warnings
 import zlib
@@ -19,8 +23,11 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.image_headers import JPEG_START, is_webp, iso_kind, jpeg_scans, webp_size
+from humangs_jax.io.color_spaces import Encoding, by_tables, is_srgb, of_code_points, of_gamma, pixels_in_srgb, read_profile
+from humangs_jax.io.image_headers import JPEG_START, is_webp, iso_kind, jpeg_scans, nclx_colors, png_chunks, webp_size
 from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
+
+logger = logging.getLogger(__name__)
 
 FORMATS = ("PNG", "JPEG")
 """Of textures. Pillow knows some forty more, one of which starts Ghostscript."""
@@ -44,11 +51,16 @@ PALETTE, GREY_AND_ALPHA = 3, 4
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Colors and, where the file has an alpha channel, alpha. Grey images become three equal channels.
+    """Colors in sRGB and, where the file has an alpha channel, alpha. Grey images become three equal channels.
+
+    A color profile that cannot be used is warned of, and the values are taken as stored.
 
     Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels than the limit.
     """
-    pixels = _read_pixels(path)
+    return _colors_and_alpha(_read_pixels(path))
+
+
+def _colors_and_alpha(pixels: Float[np.ndarray, "h w c"]) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     if pixels.shape[-1] in (1, 3):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3))), None
     colors = np.broadcast_to(pixels[..., :-1], (*pixels.shape[:2], 3))
@@ -71,7 +83,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
             colors = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
             return _mask_of_labels(np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0))))
-    colors, alpha = read_image(path)
+    colors, alpha = _colors_and_alpha(_read_pixels(path, as_stored=True))
     with reading(path, "mask"):
         if alpha is not None and alpha.min() < 1:
             return _mask_of_alpha(colors, alpha)
@@ -313,18 +325,95 @@ def image_size(path: str | Path) -> tuple[int, int]:
         return image.size
 
 
-def _read_pixels(path: str | Path) -> Float[np.ndarray, "h w c"]:
-    """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
+def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray, "h w c"]:
+    """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels; colors in sRGB, or as stored."""
     with open_image(path) as (image, data):
-        if data[:8] == PNG_SIGNATURE:
-            _check_chunks(data)
-            if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
-                return _deep_pixels(data).astype(np.float32) / np.float32(65535)
-        if image.mode.startswith("I"):  # 16-bit grey
-            return np.asarray(image, np.float32)[..., None] / np.float32(65535)
-        has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
-    return pixels.astype(np.float32) / np.float32(255)
+        levels, most = _levels(image, data)
+        colors = None if as_stored else _colors_in_srgb(path, image, data, levels, most)
+        pixels = levels.astype(np.float32) / np.float32(most)
+    if colors is None:
+        return pixels
+    alpha = pixels[..., -1:] if pixels.shape[-1] in (2, 4) else pixels[..., :0]
+    return np.concatenate([colors, alpha], axis=-1)
+
+
+def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
+    """Whole levels as stored, and the largest that there may be."""
+    if data[:8] == PNG_SIGNATURE:
+        _check_chunks(data)
+        if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
+            return _deep_pixels(data), 65535
+    if image.mode.startswith("I"):  # 16-bit grey
+        return np.asarray(image).astype(np.uint16)[..., None], 65535
+    has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+    return np.asarray(image.convert("RGBA" if has_alpha else "RGB")), 255
+
+
+# Colors -----------------------------------------------------------------------------------------------------------------
+
+
+def _colors_in_srgb(
+    path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
+) -> Float[np.ndarray, "h w 3"] | None:
+    """Colors of a file that says how they are encoded; None where levels are in sRGB already."""
+    own = levels[..., : 1 if levels.shape[-1] < 3 else 3]
+    try:
+        encoding = _encoding_in_header(image, data)
+        if encoding is None and (profile := image.info.get("icc_profile")):
+            found = read_profile(profile)
+            if found.space not in PROFILE_OF_MODE.get(image.mode, ("colors", "greys")):
+                raise Refused(f"it is one of {found.space}, and the photo is none")
+            if found.encoding is None:
+                return _by_tables(image, profile, own, most)
+            encoding = found.encoding
+    except Refused as error:
+        _tell(f"{path}: its color profile is not used: {error}")
+        return None
+    return None if encoding is None or is_srgb(encoding) else pixels_in_srgb(own, most, encoding)
+
+
+PROFILE_OF_MODE = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "P": ("colors",)}
+"""Profiles that fit Pillow's mode of a photo; greys may have one of colors, too."""
+
+
+def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
+    """What stands in a photo's header besides an ICC profile, and before it: the newest of PNG's ways goes first."""
+    if image.format == "PNG":
+        chunks = png_chunks(data)
+        if len(points := chunks.get(b"cICP", b"")) >= 2:
+            return of_code_points(points[0], points[1])
+        if b"iCCP" in chunks or b"sRGB" in chunks:
+            return None
+        return of_gamma(image.info.get("gamma"), image.info.get("chromaticity"))
+    if image.info.get("icc_profile"):
+        return None
+    points = nclx_colors(data) if image.format == "AVIF" else None
+    if image.format == "HEIF" and isinstance(nclx := image.info.get("nclx_profile"), dict):
+        points = int(nclx.get("color_primaries", 1)), int(nclx.get("transfer_characteristics", 13))
+    return None if points is None else of_code_points(*points)
+
+
+def _by_tables(image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int) -> Float[np.ndarray, "h w 3"] | None:
+    """Colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones are added as they are."""
+    from PIL import Image
+
+    if levels.shape[-1] == 1:
+        raise Refused("it is tables, and the photo is grey")
+    stored = (levels >> 8).astype(np.uint8) if most > 255 else levels
+    source = image if image.mode == "CMYK" else Image.fromarray(stored)
+    converted = by_tables(source, profile)
+    if converted is source:
+        return None
+    colors = np.asarray(converted).astype(np.float32) / np.float32(255)
+    if most > 255:
+        colors += levels.astype(np.float32) / np.float32(most) - stored.astype(np.float32) / np.float32(255)
+    return np.clip(colors, 0, 1)
+
+
+@functools.lru_cache(maxsize=1024)
+def _tell(line: str) -> None:
+    """Warn once: photos are read several times."""
+    logger.warning("%s", line)
 
 
 # PNG --------------------------------------------------------------------------------------------------------------------

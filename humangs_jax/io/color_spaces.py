@@ -1,0 +1,316 @@
+"""Colors as a file encodes them -> sRGB: ICC profiles, the code points of ITU-T H.273, and gamma with chromaticities.
+
+All that is read here is three steps: a curve from levels to light, a matrix from the primaries of the file to those of sRGB, and
+the curve of sRGB. Profiles that are tables (of printers, scanners, CMYK) are left to Little CMS. Of high dynamic range the white
+of a sheet of paper becomes 1, and what is brighter is compressed.
+"""
+
+import io
+import struct
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.io.reading import Refused
+
+Curve = Callable[[Float[np.ndarray, "*shape"]], Float[np.ndarray, "*shape"]]
+"""Levels in [0, 1] -> light, of which 1 is white."""
+
+
+class Encoding(NamedTuple):
+    """How a file encodes colors."""
+
+    curves: tuple[Curve, ...]
+    """One for each channel, or one for all."""
+    matrix: Float[np.ndarray, "3 3"]
+    """From light of the file's primaries to light of sRGB's."""
+    bright: bool = False
+    """Whether light may be far beyond white."""
+    camera: bool = False
+    """Whether light is that before a camera: it is encoded as cameras do (BT.709), not as screens show it."""
+
+
+# Curves -----------------------------------------------------------------------------------------------------------------
+
+
+def srgb_to_light(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The curve of sRGB, IEC 61966-2-1."""
+    return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+
+
+def light_to_srgb(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The inverse of `srgb_to_light`; of light in [0, 1]."""
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def light_to_bt709(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """How cameras encode light in [0, 1], ITU-R BT.709."""
+    return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
+
+
+PAPER_NITS = 203
+"""Candela per square metre that BT.2408 gives white paper in PQ and, as the level 0.75, in HLG."""
+PAPER_HLG = 0.265
+"""Light of the level 0.75 in HLG; 1 is the brightest that it holds."""
+
+
+def _pq_to_light(levels: np.ndarray) -> np.ndarray:
+    """SMPTE ST 2084."""
+    root = levels ** (1 / 78.84375)
+    nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (1 / 0.1593017578125)
+    return nits / PAPER_NITS
+
+
+def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
+    """ARIB STD-B67, the light before the camera."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
+    return light / PAPER_HLG
+
+
+def _power(exponent: float) -> Curve:
+    return lambda levels: np.maximum(levels, 0) ** exponent
+
+
+KNEE = 0.75
+"""Light above which high dynamic range is compressed towards 1."""
+
+
+def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Light whose largest channel is below 1; all three are scaled alike, so that the hue stays."""
+    largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
+    beyond = np.maximum(largest - KNEE, 0) / (1 - KNEE)
+    return light * np.where(largest > KNEE, (1 - (1 - KNEE) * np.exp(-beyond)) / largest, 1)
+
+
+# Primaries ----------------------------------------------------------------------------------------------------------------
+
+D65, D50 = (0.3127, 0.3290), (0.3457, 0.3585)
+BRADFORD = np.asarray([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+SRGB = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
+PRIMARIES = {
+    9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
+    12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
+}
+"""Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3. All others are close to sRGB's."""
+CURVES: dict[int, Curve] = {4: _power(2.2), 5: _power(2.8), 8: _power(1.0), 16: _pq_to_light, 18: _hlg_to_light}
+"""By their code point (H.273). Files of BT.709 and its kin are shown as sRGB by all programs."""
+PQ, HLG = 16, 18
+
+
+def _xyz(xy: tuple[float, float]) -> np.ndarray:
+    x, y = xy
+    return np.asarray([x / y, 1.0, (1 - x - y) / y])
+
+
+def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float]) -> np.ndarray:
+    """From light of three primaries to XYZ whose white is that of ICC profiles, D50."""
+    columns = np.stack([_xyz(each) for each in primaries], axis=1)
+    matrix = columns * np.linalg.solve(columns, _xyz(white))
+    gains = (BRADFORD @ _xyz(D50)) / (BRADFORD @ _xyz(white))
+    return np.linalg.solve(BRADFORD, gains[:, None] * BRADFORD) @ matrix
+
+
+FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
+
+
+def of_code_points(primaries: int, transfer: int) -> Encoding | None:
+    """The encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos); None where that is sRGB's."""
+    if primaries not in PRIMARIES and transfer not in CURVES:
+        return None
+    matrix = FROM_XYZ @ _to_xyz(PRIMARIES.get(primaries, SRGB), D65)
+    bright = transfer in (PQ, HLG)
+    return Encoding((CURVES.get(transfer, srgb_to_light),), matrix, bright, camera=transfer == HLG)
+
+
+GAMMA_OF_SRGB, GAMMA_SLACK = 1 / 2.2, 0.02
+"""What PNG files say of sRGB, and what makes no difference."""
+
+
+def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
+    """The encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None where that is sRGB's."""
+    curve, matrix = srgb_to_light, np.eye(3)
+    if gamma is not None and 0.1 < gamma < 10 and abs(gamma - GAMMA_OF_SRGB) > GAMMA_SLACK:
+        curve = _power(1 / gamma)
+    if chromaticities is not None and len(chromaticities) == 8:
+        points = tuple(zip(chromaticities[::2], chromaticities[1::2], strict=True))
+        with np.errstate(all="ignore"):
+            try:
+                matrix = FROM_XYZ @ _to_xyz(points[1:], points[0])
+            except (ZeroDivisionError, np.linalg.LinAlgError):
+                return None
+    encoding = Encoding((curve,), matrix)
+    return None if not np.abs(matrix).max() < LARGEST_FACTOR or is_srgb(encoding) else encoding
+
+
+LARGEST_FACTOR = 10
+"""Of a matrix between primaries that exist."""
+SAME = 0.5 / 255
+"""Colors that differ by less are the same: files whose profile is sRGB keep their values."""
+
+
+def is_srgb(encoding: Encoding) -> bool:
+    """Whether values in sRGB are the file's own."""
+    steps = np.linspace(0, 1, 9)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    return bool(np.abs(in_srgb(grid, encoding) - grid).max() < SAME)
+
+
+# To sRGB ------------------------------------------------------------------------------------------------------------------
+
+
+def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
+    """Colors in sRGB of a file's levels, both in [0, 1]."""
+    curves = encoding.curves * (3 // len(encoding.curves))
+    light = np.stack([curve(levels[:, i]) for i, curve in enumerate(curves)], axis=-1)
+    return _encode(encoding)(_light_in_srgb(light, encoding))
+
+
+def _light_in_srgb(light: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
+    light = light @ encoding.matrix.T.astype(light.dtype)
+    light = _compressed(light) if encoding.bright else light
+    return np.clip(light, 0, 1)
+
+
+def _encode(encoding: Encoding) -> Curve:
+    return light_to_bt709 if encoding.camera else light_to_srgb
+
+
+STEPS = 1 << 18
+"""Of the table of the curve back to sRGB: the steepest part is off by 1/80 of a level of 8 bits."""
+BLOCK = 1 << 20
+"""Pixels that are converted together."""
+
+
+def pixels_in_srgb(levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding) -> Float[np.ndarray, "h w 3"]:
+    """Colors in sRGB, in [0, 1], of whole levels from 0 to `most`, of one channel (grey) or three."""
+    height, width, channels = levels.shape
+    curves = encoding.curves * (3 // len(encoding.curves))
+    tables = [curve(np.arange(most + 1) / most).astype(np.float32) for curve in curves]
+    back = _encode(encoding)(np.arange(STEPS) / (STEPS - 1)).astype(np.float32)
+    found, rows = np.empty((height, width, 3), np.float32), max(1, BLOCK // width)
+    for top in range(0, height, rows):  # a block after the other: a photo of 64 million pixels takes no gigabytes
+        block = levels[top : top + rows]
+        light = np.stack([tables[i][block[..., i % channels]] for i in range(3)], axis=-1)
+        light = _light_in_srgb(light.reshape(-1, 3), encoding)
+        found[top : top + rows] = back[np.rint(light * (STEPS - 1)).astype(np.int32)].reshape(-1, width, 3)
+    return found
+
+
+def cube(encoding: Encoding, side: int = 49) -> str:
+    """A table of `in_srgb` as ffmpeg's filter lut3d reads it (.cube): red changes first."""
+    steps = np.linspace(0, 1, side)
+    blue, green, red = (axis.ravel() for axis in np.meshgrid(steps, steps, steps, indexing="ij"))
+    rows = in_srgb(np.stack([red, green, blue], axis=-1), encoding)
+    return f"LUT_3D_SIZE {side}\n" + "".join(f"{r:.6f} {g:.6f} {b:.6f}\n" for r, g, b in rows.tolist())
+
+
+# ICC profiles -------------------------------------------------------------------------------------------------------------
+
+PROFILE_BYTES = 4 << 20
+"""Of a profile that is looked at; those of presses have up to 3 MB."""
+MOST_TAGS = 200
+CLASSES = (b"mntr", b"scnr", b"prtr", b"spac")
+"""Profiles of monitors, scanners, printers and color spaces: others (links, names, effects) describe no photo."""
+SPACES = {b"RGB ": "colors", b"GRAY": "greys", b"CMYK": "CMYK"}
+WHITE_SLACK = 0.1
+"""By which the sum of the primaries of a profile differs from white."""
+
+
+class Profile(NamedTuple):
+    """An ICC profile."""
+
+    space: str
+    """One of the values of `SPACES`."""
+    encoding: Encoding | None
+    """None: it is tables, for Little CMS."""
+
+
+def read_profile(data: bytes) -> Profile:
+    """What an ICC profile says. Raises: Refused for one that is damaged, or of no photo."""
+    if len(data) > PROFILE_BYTES:
+        raise Refused(f"it has {len(data):,} bytes, expected at most {PROFILE_BYTES:,}")
+    if len(data) < 132 or data[36:40] != b"acsp" or int.from_bytes(data[:4], "big") > len(data):
+        raise Refused("it is damaged or cut off")
+    if data[12:16] not in CLASSES or data[16:20] not in SPACES:
+        kind = f"{data[12:16]!r} of {data[16:20]!r}"
+        raise Refused(f"it is of the kind {kind}, expected one of a photo in RGB, grey or CMYK")
+    space = SPACES[data[16:20]]
+    try:
+        tags = _tags(data)
+        if space == "CMYK" or b"A2B0" in tags:
+            return Profile(space, None)
+        with np.errstate(all="ignore"):
+            encoding = _of_grey(tags) if space == "greys" else _of_colors(tags)
+            steps = np.linspace(0, 1, 256)
+            if not all(np.isfinite(curve(steps)).all() for curve in encoding.curves):
+                raise Refused("its curves are no numbers")
+    except (LookupError, struct.error, OverflowError, ValueError) as error:
+        why = str(error) if isinstance(error, Refused) else "it is damaged"
+        raise Refused(why) from error
+    return Profile(space, encoding)
+
+
+def _tags(data: bytes) -> dict[bytes, bytes]:
+    count = int.from_bytes(data[128:132], "big")
+    if count > MOST_TAGS:
+        raise Refused(f"it has {count:,} parts, expected at most {MOST_TAGS}")
+    entries = [struct.unpack_from(">4sII", data, 132 + 12 * i) for i in range(count)]
+    return {name: data[at : at + size] for name, at, size in entries}
+
+
+def _of_grey(tags: dict[bytes, bytes]) -> Encoding:
+    return Encoding((_curve(tags[b"kTRC"]),), np.eye(3))
+
+
+def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
+    columns = [struct.unpack_from(">3i", tags[name + b"XYZ"], 8) for name in (b"r", b"g", b"b")]
+    to_xyz = np.asarray(columns, float).T / 65536
+    if np.abs(to_xyz.sum(axis=1) - _xyz(D50)).max() > WHITE_SLACK:
+        raise Refused("its primaries do not make white")
+    return Encoding(tuple(_curve(tags[name + b"TRC"]) for name in (b"r", b"g", b"b")), FROM_XYZ @ to_xyz)
+
+
+def _curve(tag: bytes) -> Curve:
+    """The curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a formula)."""
+    if tag[:4] == b"curv":
+        count = int.from_bytes(tag[8:12], "big")
+        table = np.frombuffer(tag[12 : 12 + 2 * count], ">u2")
+        if len(table) != count:
+            raise Refused("it has a curve that is cut off")
+        if count < 2:
+            return _power(float(table[0]) / 256 if count else 1.0)
+        return lambda levels: np.interp(levels, np.linspace(0, 1, count), table / 65535)
+    if tag[:4] != b"para":
+        raise Refused("it has a curve of an unknown kind")
+    kind = int.from_bytes(tag[8:10], "big")
+    g, *rest = (each / 65536 for each in struct.unpack_from(f">{(1, 3, 4, 5, 7)[kind]}i", tag, 12))
+    a, b, c, d, e, f = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if kind == 1:
+        a, b = rest
+        d = -b / a if a else 0.0
+    elif kind == 2:
+        a, b, e = rest
+        d, f = -b / a if a else 0.0, e
+    elif kind == 3:
+        a, b, c, d = rest
+    elif kind == 4:
+        a, b, c, d, e, f = rest
+    return lambda levels: np.where(levels >= d, np.maximum(a * levels + b, 0) ** g + e, c * levels + f)
+
+
+def by_tables(image: Any, profile: bytes) -> Any:
+    """A PIL.Image in sRGB, of one whose profile is tables. Raises: Refused for one that cannot be used."""
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.getOpenProfile(io.BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(source).lower():
+            return image
+        intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
+        target = ImageCms.createProfile("sRGB")
+        return ImageCms.profileToProfile(image, source, target, intent, outputMode="RGB", flags=flags)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
+        raise Refused("it is damaged, or not for this photo") from error
