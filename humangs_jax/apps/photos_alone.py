@@ -6,6 +6,7 @@ after looks at more than some hundred pixels of a person.
 
 import dataclasses
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,11 +48,13 @@ def import_photos(
     masks: Path | None = None,
     own_masks: bool = True,
     reduce: bool = False,
+    also: Mapping[str, object] | None = None,
 ) -> PhotosImported:
     """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what is there is replaced.
 
     Arguments: person: number on people.png, where several may be meant. height: of the person, metres. masks: folder of masks of
-    another program. own_masks: whether the detector's masks are written. reduce: whether large photos may be reduced.
+    another program. own_masks: whether the detector's masks are written. reduce: whether large photos may be reduced. also: name
+    -> content of JSON files that appear in the folder together with the capture.
     Raises: ValueError (one line) if no camera is found or several people may be meant; as `import_cameras`.
     """
     images, files = photo_files(folder)
@@ -59,8 +62,8 @@ def import_photos(
         if reduce and (smaller := _reduced(images, files, Path(place))):
             found = _look(Path(place), files, smaller, person, out)
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
-                return _written(found, Path(place), out, height, None, own_masks)
-    return _written(_look(images, files, files, person, out), images, out, height, masks, own_masks)
+                return _written(found, Path(place), out, height, None, own_masks, also)
+    return _written(_look(images, files, files, person, out), images, out, height, masks, own_masks, also)
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
@@ -109,11 +112,17 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | 
 
 
 def _written(
-    looked: _Looked, images: Path, out: Path, height: float | None, masks: Path | None, own_masks: bool
+    looked: _Looked,
+    images: Path,
+    out: Path,
+    height: float | None,
+    masks: Path | None,
+    own_masks: bool,
+    also: Mapping[str, object] | None,
 ) -> PhotosImported:
     photos, number, shown, seen = looked
     found = cameras_from_person(seen, height=height)
-    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks)
+    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks, also=also)
     views = read_description(out / "capture.json")["views"]
     written = []
     for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 from humangs_jax.cli.captures import keypoints_of, tell_found
 from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
-from humangs_jax.core.configuration import at_least
+from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Start:
     keypoints: Annotated[Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")] = None
     person: Annotated[int | None, at_least(0)] = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
-    height: float | None = None
+    height: Annotated[float | None, Range(0.3, 3)] = None
     """Height of the person without shoes, metres: the scale where there is no calibration. Default: an average person's."""
     scale: float | None = None
     """Metres per unit of the calibration. Default: 1."""
@@ -80,9 +80,40 @@ class Start:
         material = look(self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
         if self.without_masks:
             material = dataclasses.replace(material, masks=None)
+        self._check_lengths(material)
         tell(material)
         with only_writer(self.out, replaced=True):
             self._go_on(material, limits)
+
+    def _check_lengths(self, material: "Material") -> None:
+        """Raises: UsageError for an option that sets a scale or a direction which something else sets."""
+        if material.cameras is not None and self.height is not None:
+            raise UsageError("--height: is for photos without cameras: the calibration has a scale (--scale)")
+        if material.cameras is None:
+            for option, value in (("--scale", self.scale), ("--up", self.up)):
+                if value is not None:
+                    raise UsageError(f"{option}: is for a calibration, and there is none (--height sets the scale)")
+
+    def _mark(self, **more: Any) -> dict[str, dict[str, Any]]:
+        """The file that says which run made the folder: its photos, and the options that a later run has to repeat."""
+        return {MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}}
+
+    def _decisive(self) -> dict[str, Any]:
+        """Options that decide what the body is, as plain values."""
+        names = ("cameras", "masks", "keypoints", "person", "height", "scale", "up", "without_masks", "fit_masks")
+        values = {name: getattr(self, name) for name in names}
+        return {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in values.items()}
+
+    def _check_same_options(self, mark: Any) -> None:
+        """Raises: UsageError if the body of the earlier run was made with other options than this run has."""
+        earlier = mark.get("options") if isinstance(mark, dict) else None
+        if not isinstance(earlier, dict):  # of a version that did not record them
+            return
+        for name, value in self._decisive().items():
+            if name in earlier and earlier[name] != value:
+                option, before = f"--{name.replace('_', '-')}", earlier[name]
+                how = "without it" if before is None else f"with {before}"
+                raise UsageError(f"{option}: the body in {self.out} was made {how}: --overwrite begins anew")
 
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
@@ -91,12 +122,13 @@ class Start:
         from humangs_jax.io.reading import read_json
 
         if self._resumes():
+            mark = read_json(self.out / MARK)
+            self._check_same_options(mark)
             with stage("reading the fit of an earlier run"):
                 from humangs_jax.data.capture import load_capture
 
                 capture = load_capture(self.out, fit_masks=self.fit_masks)
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
-            mark = read_json(self.out / MARK)
             estimated = isinstance(mark, dict) and mark.get("calibrated") is False
             self._finish(capture, None, _without_head(limits) if estimated else limits)
             return
@@ -105,8 +137,6 @@ class Start:
         if material.cameras is None and available():
             self._from_photos_alone(material, limits)
             return
-        if self.height is not None:
-            raise UsageError("--height: is for photos without cameras: the calibration has a scale (--scale)")
         report = self._import(material) if material.cameras is not None else None
         changed = report is not None and (report.undistorted or report.turned or report.heic)
         masked = self.without_masks or (report is not None and report.masks)
@@ -129,7 +159,6 @@ class Start:
         with stage("finding the person and the cameras"):
             from humangs_jax.apps.detect import SHEET_FILE
             from humangs_jax.apps.photos_alone import import_photos
-            from humangs_jax.io.reading import write_json
 
             own_masks = not (self.without_masks or material.alpha or material.masks)
             found = import_photos(
@@ -140,8 +169,8 @@ class Start:
                 masks=material.masks,
                 own_masks=own_masks,
                 reduce=not (material.keypoints or material.masks or material.alpha),
+                also=self._mark(calibrated=False),
             )
-            write_json(self.out / MARK, {"photos": str(self.photos.resolve()), "calibrated": False})
         tell("\n".join(found.lines))
         tell_found(found.people, found.person)
         for warning in found.warnings:
@@ -200,13 +229,18 @@ class Start:
     def _import(self, material: "Material") -> "ImportReport":
         with stage("importing photos and cameras"):
             from humangs_jax.data.calibration.importing import import_cameras
-            from humangs_jax.io.reading import write_json
 
             assert material.cameras is not None
             report = import_cameras(
-                material.cameras, material.images, self.out, masks=material.masks, scale=self.scale, up=self.up, overwrite=True
+                material.cameras,
+                material.images,
+                self.out,
+                masks=material.masks,
+                scale=self.scale,
+                up=self.up,
+                overwrite=True,
+                also=self._mark(),
             )
-        write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
         tell(report)
         if report.undistorted and material.keypoints is not None:
             warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")

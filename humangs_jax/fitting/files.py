@@ -157,7 +157,8 @@ def write_fitted(
         write_fit(folder)
 
     if target.resolve() == source.resolve():
-        add_files(target, write_fit, invalid=() if record is not None else (FIT_FILE,))  # a record of other cameras
+        invalid = () if record is not None else (FIT_FILE,)  # a record of other cameras
+        add_files(target, write_fit, invalid=invalid, last=name)  # `humangs start` asks for the body
     else:
         check_place(source, target, overwrite=True)
         replace_folder(target, write, mark="capture.json")

@@ -214,6 +214,7 @@ def add_files(
     *,
     without: Iterable[str | os.PathLike[str]] = (),
     invalid: Iterable[str | os.PathLike[str]] = (),
+    last: str | os.PathLike[str] | None = None,
 ) -> None:
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
@@ -222,6 +223,7 @@ def add_files(
 
     Arguments: without: files in the folder that are out of date; those that are not replaced are deleted after the last move.
     invalid: files that must never lie beside the new ones; they are deleted before the first move.
+    last: the file that is moved last: where it was not there before, it says that all others are in place.
     Raises: OSError, naming `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
@@ -240,6 +242,8 @@ def add_files(
                 for file in invalid:
                     (folder / file).unlink(missing_ok=True)
                 new = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
+                if last is not None:
+                    new.sort(key=lambda file: file == Path(last))
                 for file in new:
                     (folder / file).parent.mkdir(parents=True, exist_ok=True)
                     (temporary / file).replace(folder / file)

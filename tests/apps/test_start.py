@@ -28,6 +28,7 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import people as blazepose
 from humangs_jax.fitting import fit_capture
 from humangs_jax.io.images import read_image, to_uint8, write_png
+from humangs_jax.io.reading import write_json
 from humangs_jax.network.presets import tiny
 from tests.refinement.refinement_cases import toy_avatar, toy_capture
 
@@ -230,7 +231,14 @@ def test_steps_on_the_head_are_for_calibrated_cameras(calibrated, mine, detected
     monkeypatch.setattr(Start, "_fit", lambda self, material, one_moment=None: (None, None))
     monkeypatch.setattr(Start, "_finish", lambda self, capture, estimate, limits: asked.append(limits))
     found = photos_alone.PhotosImported((), (), detect.found_in_capture("me"), 1, True)
-    monkeypatch.setattr(photos_alone, "import_photos", lambda _, out, **options: out.mkdir() or found)
+
+    def imported(_, out, *, also, **options):
+        out.mkdir()
+        for name, content in also.items():
+            write_json(out / name, content)
+        return found
+
+    monkeypatch.setattr(photos_alone, "import_photos", imported)
     if not calibrated:
         without(mine, *TOOLS)
     assert cli.execute(["start", str(mine), "--out", "me"]) == 0
@@ -262,6 +270,57 @@ def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypa
 def test_a_height_without_a_use_is_refused(mine, detected, capsys):
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_USAGE
     assert "--height: is for photos without cameras" in capsys.readouterr().err
+
+
+def test_a_height_in_centimetres_is_refused_before_the_photos_are_looked_at(mine, capsys):
+    without(mine, "cameras")
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "178"]) == cli.BAD_USAGE
+    assert "--height 178: expected 0.3 to 3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("option", "value"), [("--scale", "0.01"), ("--up", "+z")])
+def test_options_of_a_calibration_are_refused_without_one(option, value, mine, detected, capsys):
+    without(mine, "cameras")
+    assert cli.execute(["start", str(mine), "--out", "me", f"{option}={value}"]) == cli.BAD_USAGE
+    assert f"{option}: is for a calibration, and there is none" in capsys.readouterr().err
+
+
+def test_without_the_detector_a_height_does_not_hide_how_to_install_it(mine, capsys):
+    without(mine, "cameras", "masks", "keypoints")
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.78"]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert "pip install 'humangs_jax[photos]'" in out and "cameras, masks and keypoints missing" in err
+
+
+def test_a_run_that_was_interrupted_while_it_wrote_can_be_run_again(mine, detected, monkeypatch, capsys):
+    """The mark of `start` appears together with the capture."""
+    without(mine, *TOOLS)
+
+    def interrupted(_, out, *, also, **options):
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        for name, content in {"capture.json": {}, **also}.items():
+            write_json(out / name, content)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(photos_alone, "import_photos", interrupted)
+    for _ in range(2):
+        assert cli.execute(["start", str(mine), "--out", "me"]) == cli.INTERRUPTED
+        assert "not empty" not in capsys.readouterr().err
+
+
+def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
+    """The same command goes on from the body; one with another height would have had no effect."""
+    without(mine, "cameras")
+    first = Start(mine, Path("me"), height=1.7)
+    Path("me").mkdir()
+    for name, content in {"capture.json": {}, "fit.json": {}, **first._mark(calibrated=False)}.items():
+        write_json(Path("me") / name, content)
+    Path("me/body.npz").touch()
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.8"]) == cli.BAD_USAGE
+    assert "--height: the body in me was made with 1.7: --overwrite begins anew" in capsys.readouterr().err
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
+    assert "begins anew" not in capsys.readouterr().err  # it goes on, to a capture without photos
 
 
 @pytest.mark.parametrize(("calibrated", "sheet"), [(True, "me/people.png"), (False, "me_people.png")])

@@ -358,3 +358,18 @@ def test_names_that_are_no_utf8_stay_what_they_are_in_text(tmp_path):
     assert os.fsencode(file.name) == b"caf\xe9.mtl" and file.read_bytes() == b"map_Kd caf\xe9.png\n"
     atomic.write_text(tmp_path / "half.txt", "half \ud800, caf\u00e9")
     assert (tmp_path / "half.txt").read_bytes().decode() == "half \\ud800, caf\u00e9"
+
+
+def test_the_file_that_is_to_be_last_is_moved_last(tmp_path, monkeypatch):
+    """Where it was not there before, it says that all others are in place."""
+    moved, replace = [], Path.replace
+
+    def noted(self, target):
+        moved.append(Path(target).name)
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", noted)
+    names = ("a.json", "body.npz", "c.json")
+    write = lambda folder: (folder.mkdir(exist_ok=True), [(folder / name).touch() for name in names])
+    atomic.add_files(tmp_path / "me", write, last="body.npz")
+    assert moved == ["a.json", "c.json", "body.npz"]

@@ -7,7 +7,7 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 import dataclasses
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -45,7 +45,7 @@ from humangs_jax.data.capture_checks import CaptureError, check_names, check_pla
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
-from humangs_jax.io.reading import check_limit, reading
+from humangs_jax.io.reading import check_limit, reading, write_json
 
 SIZES_SHOWN = 5
 """In a report."""
@@ -103,6 +103,7 @@ def import_cameras(
     every: int = 1,
     frames: int | None = None,
     overwrite: bool = False,
+    also: Mapping[str, object] | None = None,
 ) -> ImportReport:
     """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is still to be made.
 
@@ -115,6 +116,7 @@ def import_cameras(
         every, frames: of videos, the frame step and the largest number of frames.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
             None: as the format says.
+        also: name -> content of JSON files that appear in the folder together with the capture.
 
     Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for everything else.
     """
@@ -128,7 +130,9 @@ def import_cameras(
     check_place(out, overwrite, (source, images, masks))
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
         calibration = read_calibration(source, lambda name: photo_size(photo_of(images, name, source)))
-        return import_calibration(calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers)
+        return import_calibration(
+            calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers, also=also
+        )
 
 
 def import_calibration(
@@ -140,6 +144,7 @@ def import_calibration(
     scale: float = 1.0,
     up: str | None = None,
     pixel_centers: str | None = None,
+    also: Mapping[str, object] | None = None,
 ) -> ImportReport:
     """`import_cameras` of a calibration in memory, which replaces a capture that is there."""
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
@@ -173,7 +178,12 @@ def import_calibration(
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
     cut: list[str] = []
-    write = lambda folder: cut.extend(_write(folder, converted, photos, turns, names, canvas))
+
+    def write(folder: Path) -> None:
+        cut.extend(_write(folder, converted, photos, turns, names, canvas))
+        for name, content in (also or {}).items():
+            write_json(folder / name, content)
+
     replace_folder(out, write, mark="capture.json")
     if cut:
         warnings.append(f"the person is cut off where white was added to {few(cut, 1)}: it is taken for background")
