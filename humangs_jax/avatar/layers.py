@@ -27,20 +27,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar, surface_normals, turned_normals
-from humangs_jax.avatar.frames import draw, draw_gaussians, image_of, posed, splatting_of
+from humangs_jax.avatar.frames import draw, image_of, posed, splatting_of
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
-from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import write_png
 from humangs_jax.io.reading import limits
+from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.splatting import Rendering
+from humangs_jax.rendering.splatting import Rendering, render
 
 LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
@@ -142,18 +142,21 @@ def exr_view(
     if "position" in layers:
         positions = np.where(alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0)
         channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
-    if layers & {"normal", "part"}:
-        gaussians = posed(avatar, pose)
+    values = {}
     if "normal" in layers:
-        sums = splatted(gaussians, camera, how, gaussian_normals(avatar, pose))
+        values["normal"] = gaussian_normals(avatar, pose)
+    if "part" in layers:
+        parts = gaussian_parts(avatar)
+        present = np.unique(parts)
+        values["part"] = jnp.asarray(parts[:, None] == present, jnp.float32)
+    drawn = splatted(posed(avatar, pose), camera, how, values) if values else {}
+    if "normal" in layers:
+        sums = drawn["normal"]
         length = np.linalg.norm(sums, axis=-1, keepdims=True)
         normals = np.divide(sums, length, out=np.zeros_like(sums), where=(length > 0) & (alpha[..., None] > 0))
         channels |= {f"normal.{axis}": normals[..., i] for i, axis in enumerate("XYZ")}
     if "part" in layers:
-        parts = gaussian_parts(avatar)
-        present = np.unique(parts)
-        weights = splatted(gaussians, camera, how, jnp.asarray(parts[:, None] == present, jnp.float32))
-        channels["part"] = np.where(alpha >= COVERED, 1 + present[weights.argmax(axis=-1)], 0).astype(np.float32)
+        channels["part"] = np.where(alpha >= COVERED, 1 + present[drawn["part"].argmax(axis=-1)], 0).astype(np.float32)
         attributes["parts"] = ",".join(avatar.joint_names)
     plain = _plain_view(name, camera, rendering)
     depth = plain.depth if "z" in layers else None
@@ -186,13 +189,15 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
     return points.astype(np.float32)
 
 
-def splatted(gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Float[Array, "g c"]) -> Float[np.ndarray, "h w c"]:
-    """Any numbers of Gaussians summed by the weights of their colors: splatting draws three channels at a time."""
-    count = values.shape[1]
-    triples = jnp.pad(values, ((0, 0), (0, -count % 3))).reshape(len(values), -1, 3)
-    each = (replace(gaussians, colors=triples[:, i], harmonics=None) for i in range(triples.shape[1]))
-    drawn = draw_gaussians(each, [camera] * triples.shape[1], jnp.zeros(3), how)
-    return np.concatenate([np.asarray(rendering.rgb) for rendering in drawn], axis=-1)[..., :count]
+def splatted(
+    gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Mapping[str, Float[Array, "g c"]]
+) -> dict[str, Float[np.ndarray, "h w c"]]:
+    """Any numbers of Gaussians, by name, summed by the weights of their colors; all of them in one image."""
+    planned = plan_buffers(gaussians, camera, how)
+    together = jnp.concatenate(list(values.values()), axis=-1)
+    drawn = np.asarray(render(gaussians, camera, planned, features=together).features)
+    ends = np.cumsum([each.shape[1] for each in values.values()])
+    return dict(zip(values, np.split(drawn, ends[:-1], axis=-1), strict=True))
 
 
 def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:

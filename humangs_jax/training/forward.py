@@ -100,14 +100,15 @@ def draw_posed(posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array
     def one(target):
         splats, opacities, colors, camera, background = target
         gaussians = replace(jax.tree.map(lambda x: x[0], posed), opacities=opacities, colors=colors)
-        rendering = draw_projected(splats, gaussians, camera, config.splat, background)
         if not config.loss.distortion:
-            return Drawn(rendering)
+            return Drawn(draw_projected(splats, gaussians, camera, config.splat, background))
         z = splats.depths - jax.lax.stop_gradient(jnp.mean(splats.depths))  # small numbers have small squares
-        gaussians = replace(gaussians, colors=jnp.stack([z, z**2, 0 * z], axis=-1))
-        moments = draw_projected(splats, gaussians, camera, config.splat, jnp.zeros(3, z.dtype))
-        first, second = (safe_divide(moments.rgb[..., i], moments.alpha) for i in (0, 1))
-        return Drawn(rendering, ray_spread(moments.alpha, first, second))
+        # no colors, to which harmonics would be added, and which are not negative
+        powers = jnp.stack([z, z**2], axis=-1)
+        rendering = draw_projected(splats, gaussians, camera, config.splat, background, powers)
+        assert rendering.features is not None  # those that were given
+        first, second = (safe_divide(rendering.features[..., i], rendering.alpha) for i in (0, 1))
+        return Drawn(replace(rendering, features=None), ray_spread(rendering.alpha, first, second))
 
     projected = stage("projected splats", project, replace(posed, opacities=None, colors=None))
     return stage("images", draw, projected, posed.opacities, posed.colors)
