@@ -4,37 +4,32 @@
     people.png       the sheet: everybody, with numbers
     masks/NAME.png   of the chosen person
 
-With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo,
-and where several are of nearly one size, by the colors of their upper bodies and legs.
+Who of one photo is who of another: `apps.same_people`.
 """
 
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
+from humangs_jax.apps.same_people import Found, PhotoPeople, inside_photo, is_unclear, rivals, same_people
 from humangs_jax.apps.start import photo_files
-from humangs_jax.core.array_types import Bool, Float, Int, UInt
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
-from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, seen_person, write_people
+from humangs_jax.data.keypoints.formats import ImagePeople, seen_person, write_people
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import box_of
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
-from humangs_jax.fitting.triangulation import Seen, in_order_of_time, match_colors, match_people
-from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
-RIVAL = 0.35
-"""Somebody with this share of the pixels of the largest person may be meant as well as he."""
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
 COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
@@ -43,36 +38,8 @@ FAINT = 0.45
 """Share of the color over a person's pixels."""
 BEYOND = 0.03
 """Share of a person's size that a landmark outside of the photo is beyond its border."""
-PARTS = ((11, 12, 24, 23), (23, 24, 26, 25))
-"""Corners of upper body and thighs: landmarks of the left and right."""
-LARGE_PEOPLE = 5
-"""In a photo, at most, that are told apart by their colors."""
-
-
-class Found(NamedTuple):
-    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column). area: pixels of the person.
-    mirrored: left and right were exchanged, as other views show; it is repaired.
-    """
-
-    person: SeenPerson
-    mask: UInt[np.ndarray, "h w"]
-    corner: tuple[int, int]
-    area: float
-    mirrored: bool = False
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class PhotoPeople:
-    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it.
-    colors: several are large, and colors tell who is who. unclear: they do not.
-    """
-
-    name: str
-    size: tuple[int, int]
-    thumbnail: Float[np.ndarray, "h w 3"]
-    people: tuple[Found | None, ...]
-    colors: bool = False
-    unclear: bool = False
+PLAINLY = 0.5
+"""Masks or keypoints on somebody else have to leave the person less than this share of what they give the other one."""
 
 
 def found_in_photos(folder: Path) -> list[PhotoPeople]:
@@ -99,32 +66,69 @@ def person_in_capture(
     folder: Path, photos: Photos | Capture, keypoints: Keypoints | None = None, person: int | None = None
 ) -> tuple[list[PhotoPeople], int]:
     """The people in the photos of a capture folder, and the number of the one who is meant: by keypoints, if there are any, else
-    by the number asked for, else by masks, else by size. Raises: see `found_in_photos`, `choose`; ValueError for keypoints or
-    masks of nobody.
+    by the number asked for, else by masks, else by size.
+
+    Raises: see `found_in_photos`, `choose`, `person_of`; ValueError for a photo whose keypoints are of nobody found there.
     """
     people, sheet = found_in_capture(folder), folder / SHEET_FILE
-    if keypoints is None and (photos.masks is None or person is not None or not people[0].people):
-        return people, choose(people, person, sheet)
+    if keypoints is None:
+        if photos.masks is None or person is not None or not people[0].people:
+            return people, choose(people, person, sheet)
+        return person_of(people, photos.masks, sheet)
+    people, number = person_of(people, keypoints, sheet)
+    lost = [
+        photo.name
+        for v, photo in enumerate(people)
+        if _has_any(keypoints, v) and photo.people[number] is None and any(photo.people)
+    ]
+    if lost:
+        told = f"{few(lost)}: the keypoints are of nobody who was found there: see {sheet}; give masks, or leave the photo out"
+        raise _refused(told, people, sheet)
+    return people, number
 
-    def agreement(v: int, number: int) -> float:
-        mask = person_mask(people[v], number)
-        if keypoints is None:
-            assert photos.masks is not None
-            return float(np.sum(photos.masks[v] * mask))
-        x, y = np.floor(keypoints.points[v]).astype(int).T
-        seen = (keypoints.confidences[v] > 0) & _inside(x, y, *mask.shape[::-1])
-        return float(np.sum(mask[y[seen], x[seen]]))
 
-    sums = [sum(agreement(v, i) for v in range(len(people))) for i in range(len(people[0].people))]
+def person_of(
+    photos: Sequence[PhotoPeople], given: Keypoints | Float[np.ndarray, "v h w"], sheet: Path
+) -> tuple[list[PhotoPeople], int]:
+    """The photos, and the number of the one whose keypoints or masks these are, which decide in each photo.
+
+    Arguments: sheet: see `choose`.
+    Raises: ValueError for keypoints or masks of nobody, and where it is unclear who of a photo without any is meant.
+    """
+    kind = "keypoints" if isinstance(given, Keypoints) else "masks"
+    scores = [[_agreement(each, given, v) for each in photo.people] for v, photo in enumerate(photos)]
+    sums = np.sum(np.asarray(scores), axis=0)
     if max(sums, default=0.0) <= 0:
-        write_sheet(sheet, people)
-        given = "masks" if keypoints is None else "keypoints"
-        raise ValueError(f"the {given} are of nobody who was found in the photos: see {sheet}")
-    return people, int(np.argmax(sums))
+        raise _refused(f"the {kind} are of nobody who was found in the photos: see {sheet}", photos, sheet)
+    number, settled = int(np.argmax(sums)), []
+    for photo, row in zip(photos, scores, strict=True):
+        people, best = list(photo.people), int(np.argmax(row))
+        if row[number] < PLAINLY * row[best]:
+            # the matching put somebody else there, or nobody
+            people[number], people[best] = people[best], people[number]
+        settled.append(dataclasses.replace(photo, people=tuple(people), unclear=photo.unclear and max(row) <= 0))
+    blank = [v for v in range(len(photos)) if not _has_any(given, v)]
+    if unclear := [photos[v].name for v in blank if is_unclear(settled, v, number)]:
+        told = f"{few(unclear)}: which of the people of {sheet} is meant? There are no {kind} of the person: add them"
+        raise _refused(told, settled, sheet)
+    return settled, number
 
 
-def _inside(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int) -> Bool[np.ndarray, " n"]:
-    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
+def _has_any(given: Keypoints | Float[np.ndarray, "v h w"], view: int) -> bool:
+    return bool(np.any(given.confidences[view] if isinstance(given, Keypoints) else given[view]))
+
+
+def _agreement(found: Found | None, given: Keypoints | Float[np.ndarray, "v h w"], view: int) -> float:
+    """How much of the keypoints or the mask of a view is on the mask of somebody who was found there."""
+    if found is None:
+        return 0.0
+    mask, (top, left) = found.mask / np.float32(255), found.corner
+    height, width = mask.shape
+    if not isinstance(given, Keypoints):
+        return float(np.sum(given[view, top : top + height, left : left + width] * mask))
+    x, y = np.floor(given.points[view]).astype(int).T - np.asarray([[left], [top]])
+    seen = (given.confidences[view] > 0) & inside_photo(x, y, width, height)
+    return float(np.sum(mask[y[seen], x[seen]]))
 
 
 def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
@@ -165,91 +169,7 @@ def _found(person: DetectedPerson, photo: Float[np.ndarray, "h w 3"]) -> Found:
     return Found(seen_person(person), cut, (top, left), float((cut > 255 * SEEN).sum()))
 
 
-# Who is who ----------------------------------------------------------------------------------------------------------
-
-
-def same_people(
-    photos: Sequence[PhotoPeople], cameras: Camera | None = None, frames: Sequence[int] | None = None
-) -> list[PhotoPeople]:
-    """The photos with people in such an order that the i-th of each is the same person.
-
-    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or, where several are large, that
-    of colors. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
-    """
-    if cameras is not None and len(photos) > 1:
-        rows = _matched(photos, cameras, np.asarray([0] * len(photos) if frames is None else frames))
-    else:
-        photos = _by_colors(photos) if len(photos) > 1 else photos
-        rows = [list(photo.people) for photo in photos]
-    most = max((len(row) for row in rows), default=0)
-    ordered = [
-        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row)))) for photo, row in zip(photos, rows, strict=True)
-    ]
-    order = np.argsort([-area for area in _areas(ordered)], kind="stable")
-    return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
-
-
-def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
-    """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
-    found = [[each for each in photo.people if each is not None] for photo in photos]  # the largest first
-    large = [[each for each in people if each.area > RIVAL * people[0].area][:LARGE_PEOPLE] for people in found]
-    most = max(range(len(photos)), key=lambda v: len(large[v]))
-    if len(large[most]) < 2:
-        return photos
-    first = _colors(photos[most], large[most])
-    ordered = []
-    for photo, people in zip(photos, large, strict=True):
-        order = match_colors(first, _colors(photo, people)) if people else ()
-        if order is None:
-            ordered.append(dataclasses.replace(photo, unclear=True))
-            continue
-        row: list[Found | None] = [None] * len(first)
-        for i, each in zip(order, people, strict=True):
-            row[i] = each
-        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True))
-    return ordered
-
-
-def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
-    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
-    height, width = photo.thumbnail.shape[:2]
-    u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
-    found = np.full((len(people), len(PARTS), 3), np.nan)
-    for i, each in enumerate(people):
-        for k, part in enumerate(PARTS):
-            a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
-            x, y = np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
-            inside = _inside(x, y, width, height)
-            if inside.any():
-                found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
-    return found
-
-
-def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
-    people = zip(*(photo.people for photo in photos), strict=True)
-    return [sum(found.area for found in person if found is not None) for person in people]
-
-
-def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[list[Found | None]]:
-    K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
-    points = [tuple(each.person.points for each in photo.people if each is not None) for photo in photos]
-    times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
-    matches = [match_people([Seen(K[v], transforms[v], points[v]) for v in own], MEDIAPIPE_33.mirror) for own in times]
-    rows: list[list[Found | None]] = [[] for _ in photos]
-    for own, people in zip(times, in_order_of_time(matches), strict=True):
-        for match in people:
-            for i, v in enumerate(own):
-                found = None if match is None or (member := match.members[i]) is None else photos[v].people[member]
-                mirrored = found is not None and match is not None and match.mirrored[i]
-                rows[v].append(exchanged(found) if mirrored else found)
-    return rows
-
-
-def exchanged(found: Found) -> Found:
-    """The person with left and right exchanged."""
-    order = np.asarray(MEDIAPIPE_33.mirror)
-    person = dataclasses.replace(found.person, points=found.person.points[order], world=found.person.world[order])
-    return found._replace(person=person, mirrored=True)
+# Who is meant -------------------------------------------------------------------------------------------------------
 
 
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
@@ -261,9 +181,20 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     try:
         return _chosen(photos, person, sheet)
     except ValueError:
-        sheet.parent.mkdir(parents=True, exist_ok=True)
-        write_sheet(sheet, photos)
+        _write_refused(sheet, photos)
         raise
+
+
+def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
+    """Write the sheet that an error speaks of."""
+    sheet.parent.mkdir(parents=True, exist_ok=True)
+    write_sheet(sheet, photos)
+
+
+def _refused(message: str, photos: Sequence[PhotoPeople], sheet: Path) -> ValueError:
+    """An error about who is who; its sheet is written."""
+    _write_refused(sheet, photos)
+    return ValueError(message)
 
 
 def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
@@ -273,18 +204,19 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
     if person is not None:
         if not 0 <= person < count:
             raise ArgumentError("person", f"{person}: expected 0 to {count - 1}, as on {sheet}")
-    else:
-        areas = _areas(photos)
-        rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
-        if rivals:
-            where = few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
-            raise ValueError(f"{len(rivals) + 1} people in {where}: expected one. Person 0 to {len(rivals)}: numbers on {sheet}")
-    if unclear := [photo.name for photo in photos if photo.unclear]:
+    elif others := rivals(photos):
+        where = [photo.name for photo in photos if any(photo.people[i] is not None for i in others)]
+        most = max(sum(photo.people[i] is not None for i in (0, *others)) for photo in photos)
+        numbers = f"Person 0 to {len(others)}: numbers on {sheet}"
+        raise ValueError(f"{max(most, 2)} people in {few(where)}: expected one. {numbers}")
+    chosen = person or 0
+    if unclear := [photo for i, photo in enumerate(photos) if is_unclear(photos, i, chosen)]:
+        clues = "colors do" if any(photo.unclear for photo in unclear) else "places do"
         raise ValueError(
-            f"{few(unclear)}: which of the people of {sheet} is meant? Their colors do not tell: cut these photos down to "
-            "one person, or leave them out"
+            f"{few([photo.name for photo in unclear])}: which of the people of {sheet} is meant? Their {clues} not tell: cut "
+            "these photos down to one person, leave them out, or give masks or keypoints of the one"
         )
-    return person or 0
+    return chosen
 
 
 def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
@@ -298,6 +230,9 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
         beyond = np.maximum(-points, points - np.asarray(photo.size))
         if (beyond > BEYOND * np.ptp(points, axis=0).max()).any():
             told.append(f"{photo.name}: a part of the person is outside of the photo")
+    if apart := [photo.name for photo, each in found if each.apart]:
+        where = "the person is not where the other photos of the moment show them"
+        told.append(f"{few(apart)}: {where}: the calibration is off there, or it is somebody else")
     mirrored = "left and right of the person were exchanged, as the other views show: repaired"
     return told + [f"{photo.name}: {mirrored}" for photo, each in found if each.mirrored]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from humangs_jax.apps import detect
-from humangs_jax.apps.detect import PhotoPeople
+from humangs_jax.apps.same_people import PhotoPeople, exchanged, same_people
 from humangs_jax.apps.start import photo_files
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
@@ -92,7 +92,7 @@ class _Looked(NamedTuple):
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | None, out: Path) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
-    photos = detect.same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
+    photos = same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
     # beside `out`, which a refusal leaves as it is
     number = detect.choose(photos, person, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
@@ -128,7 +128,7 @@ def _written(
     for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):
         photo, people = photos[shown[view]], list(photos[shown[view]].people)
         if mirrored and (person := people[number]) is not None:
-            people[number] = detect.exchanged(person)
+            people[number] = exchanged(person)
         name, size = f"{Path(described['image']).stem}.png", (report.width, report.height)  # padded
         written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
     detect.write_found(out, written, number, masks=own_masks, to_capture=True)

@@ -188,13 +188,19 @@ CLEARLY, RATHER = 0.5, 0.8
 """Sides are exchanged if the distance is then less than this share of what it is without; the second where it does not agree
 without."""
 FARTHEST = 1.0
-"""Metres between a person's places in two frames that follow each other."""
-SEEN, FEWEST = 0.3, 6
-"""Least visibility of a landmark that counts, and least number of those that two views share."""
-
-
+"""Metres between a person's places in two frames that follow each other, where several views show where they are."""
+NEAR = 0.5
+"""A share of a person's size in the photo: how far they go in the photo of one camera from one frame to the next."""
+RESIZED = 1.5
+"""The most by which a person's size in the photo of one camera changes from one frame to the next, a factor."""
+STILL_DEGREES, STILL_METRES = 10.0, 0.3
+"""A view that has turned and moved by no more than this since the last frame is one camera's."""
 PLAIN = 0.1
 """Of colors in [0, 1]: how much farther apart the next best order of people has to be."""
+EXPOSURES = np.geomspace(0.25, 4.0, 33)
+"""Factors on the colors of a photo that its exposure may make."""
+SEEN, FEWEST = 0.3, 6
+"""Least visibility of a landmark that counts, and least number of those that two views share."""
 
 
 class Seen(NamedTuple):
@@ -324,41 +330,109 @@ def _error(view: Seen, row: Float[np.ndarray, "k 3"], points: Float[np.ndarray, 
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
 
 
-def in_order_of_time(frames: Sequence[list[Match]]) -> list[list[Match | None]]:
-    """The matches of frames that follow each other, so that the i-th of each is one person: who is nearest to where he was.
+def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]) -> bool:
+    """Tells whether two views see enough of the same landmarks to say that they show two people."""
+    return int(((first[:, 2] >= SEEN) & (second[:, 2] >= SEEN)).sum()) >= FEWEST
 
-    People of later frames who are nobody's are added at the end; None where a frame does not have a person.
+
+def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None) -> list[list[Match | None]]:
+    """The matches of frames that follow each other, so that the i-th of each is one person.
+
+    That is who is nearest in space to where the person was; of the rest, whoever is plainly nearest in the photo of one camera.
+
+    Arguments: shown: the views of each frame; None: people are followed in space alone.
+    Returns: for each frame a match for each person, None where the frame does not have the person. Whoever is linked to nobody
+    is added at the end: that may be one of the others all the same.
     """
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
-        left = list(range(len(matches)))
-        last = [next(m.center for m in reversed(person) if m is not None) for person in people]
-        pairs = sorted(
-            (float(np.nan_to_num(np.linalg.norm(matches[i].center - center), nan=np.inf)), j, i)
-            for j, center in enumerate(last)
-            for i in left
-        )
-        chosen: dict[int, int] = {}
-        for distance, j, i in pairs:
-            if j not in chosen and i in left and distance < FARTHEST:
-                chosen[j] = i
-                left.remove(i)
+        last = [max(g for g in range(f) if person[g] is not None) for person in people]
+        chosen = _near_in_space([_last_center(person) for person in people], matches)
+        if shown is not None:
+            free = [j for j in range(len(people)) if j not in chosen]
+            left = [i for i in range(len(matches)) if i not in chosen.values()]
+            costs = np.full((len(free), len(left)), np.inf)
+            for (row, j), (column, i) in itertools.product(enumerate(free), enumerate(left)):
+                before = people[j][last[j]]
+                assert before is not None
+                costs[row, column] = _moved_in_photos(shown[last[j]], before, shown[f], matches[i])
+            chosen |= {free[row]: left[column] for row, column in _plainly_nearest(costs)}
         for j, person in enumerate(people):
             person.append(matches[chosen[j]] if j in chosen else None)
-        people += [[*[None] * f, matches[i]] for i in left]
+        new = [match for i, match in enumerate(matches) if i not in chosen.values()]
+        people += [[*[None] * f, match] for match in new]
     return [[person[f] for person in people] for f in range(len(frames))]
+
+
+def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
+    """Where several views last saw a person; NaN if they never did."""
+    centers = [match.center for match in person if match is not None and np.isfinite(match.center).all()]
+    return centers[-1] if centers else np.full(3, np.nan)
+
+
+def _near_in_space(last: Sequence[Float[np.ndarray, "3"]], matches: Sequence[Match]) -> dict[int, int]:
+    """For people who were at `last` the match that is nearest, the nearest pairs first."""
+    distances = [
+        (float(np.linalg.norm(match.center - center)), j, i) for j, center in enumerate(last) for i, match in enumerate(matches)
+    ]
+    chosen: dict[int, int] = {}
+    for _, j, i in sorted(each for each in distances if each[0] < FARTHEST):
+        if j not in chosen and i not in chosen.values():
+            chosen[j] = i
+    return chosen
+
+
+def _moved_in_photos(before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match) -> float:
+    """How far one person would have gone in the photo of some camera, a share of the size; infinite if none shows both."""
+    moved = [float("inf")]
+    for v, w in itertools.product(range(len(before)), range(len(now))):
+        p, q = first.members[v], second.members[w]
+        if p is None or q is None or not _stands_still(before[v], now[w]):
+            continue
+        (place, size), (other, other_size) = (_box(row) for row in (before[v].people[p], now[w].people[q]))
+        if max(size, other_size) <= RESIZED * min(size, other_size):
+            moved.append(float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9))
+    return min(moved)
+
+
+def _stands_still(before: Seen, now: Seen) -> bool:
+    """Tells whether two views are one camera that hardly moved."""
+    first, second = before.cam_from_world[:3], now.cam_from_world[:3]
+    turn = first[:, :3] @ second[:, :3].T
+    degrees = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    way = first[:, :3].T @ first[:, 3] - second[:, :3].T @ second[:, 3]
+    return bool(degrees <= STILL_DEGREES and np.linalg.norm(way) <= STILL_METRES)
+
+
+def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """The middle of the landmarks that are seen, pixels, and the longer side of the box around them."""
+    seen = row[row[:, 2] >= SEEN, :2]
+    seen = seen if len(seen) else row[:, :2]
+    return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())
+
+
+def _plainly_nearest(costs: Float[np.ndarray, "n m"]) -> list[tuple[int, int]]:
+    """Pairs below `NEAR` that beat all others of their row and column by the factor `CLEARLY`."""
+    found = []
+    for row, column in np.argwhere(costs < NEAR).tolist():
+        others = np.r_[np.delete(costs[row], column), np.delete(costs[:, column], row)]
+        if costs[row, column] < CLEARLY * others.min(initial=np.inf):
+            found.append((row, column))
+    return found
 
 
 def match_colors(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:
     """For each of m people of a photo which of n >= m of another one has the same colors; None if that is not plain.
 
+    It is plain if any other order of people leaves larger differences at whatever exposure suits that order best.
+
     Arguments: colors in [0, 1] of k parts of the body; NaN for parts that are not seen.
     """
-    apart = np.linalg.norm(second[:, None] - first[None], axis=-1)
+    apart = np.linalg.norm(second[:, None] - EXPOSURES[:, None, None, None, None] * first[None], axis=-1)
     seen = np.isfinite(apart)
     apart = np.where(seen, apart, 0).sum(-1) / np.maximum(seen.sum(-1), 1)
     options = sorted(
-        (float(sum(apart[i, j] for i, j in enumerate(order))), order)
+        (float(min(sum(each[i, j] for i, j in enumerate(order)) for each in apart)), order)
         for order in itertools.permutations(range(len(first)), len(second))
     )
     return options[0][1] if len(options) == 1 or options[1][0] - options[0][0] >= PLAIN else None

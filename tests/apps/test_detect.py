@@ -1,13 +1,16 @@
 """`humangs detect`: who is chosen, what is written, and what is said where that is not clear."""
 
+import dataclasses
 import shutil
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from changes import edit_json
+from scipy.spatial.transform import Rotation
 
 from humangs_jax import cli
 from humangs_jax.apps import detect
@@ -15,8 +18,9 @@ from humangs_jax.apps.detect import Found, PhotoPeople, choose, person_mask, sam
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.keypoints.formats import SeenPerson
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.keypoints.reading import read_keypoints
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import read_grey, write_png
 
 SIZE = (40, 30)
@@ -154,6 +158,177 @@ def test_a_capture_without_masks_gets_its_people_matched_by_its_cameras(tmp_path
     assert [p.people[0].area for p in ordered] == [50.0, 50.0, 50.0, 50.0]
     repaired = lambda person: [line for line in detect.remarks(ordered, person) if line.endswith("repaired")]
     assert repaired(0) == [] and [line.split(":")[0] for line in repaired(1)] == [f"{capture.names[2]}.png"]
+
+
+# One person in front of calibrated cameras is one person ---------------------------------------------------------------
+
+SIDE, FOCAL = 600, 700.0
+"""Pixels of the photos, and of their focal length."""
+BODY = np.random.default_rng(3).normal(0, [0.15, 0.45, 0.1], (33, 3))
+OTHER_BODY = np.random.default_rng(4).normal(0, [0.15, 0.45, 0.1], (33, 3))
+
+
+def camera_at(degrees, turned=0.0, distance=3.5):
+    """cam_from_world of a camera around the origin that looks at it. turned: about its own x, degrees."""
+    look, tilt = (Rotation.from_euler(axis, angle, degrees=True).as_matrix() for axis, angle in (("y", degrees), ("x", turned)))
+    return np.block([[tilt @ look, (tilt @ [0, 0, distance])[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def batch(matrices):
+    K = jnp.asarray([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
+    cameras = [Camera(K, jnp.asarray(matrix, jnp.float32), SIDE, SIDE) for matrix in matrices]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+
+
+def moved(body, *step):
+    return body + np.asarray(step)
+
+
+def seen_at(name, matrix, *bodies, areas=(9e3, 8e3)):
+    """A photo of some bodies by a camera."""
+    people = []
+    for body, area in zip(bodies, areas, strict=False):
+        local = body @ matrix[:3, :3].T + matrix[:3, 3]
+        pixels = np.c_[local[:, :2] / local[:, 2:] * FOCAL + SIDE / 2, np.ones(33)]
+        people.append(found(0, area)._replace(person=SeenPerson(pixels, np.zeros((33, 3)), 1.0)))
+    return PhotoPeople(name, (SIDE, SIDE), np.ones((30, 30, 3)), tuple(sorted(people, key=lambda each: -each.area)))
+
+
+def is_in_every_photo(photos, sheet):
+    return choose(photos, None, sheet) == 0 and all(photo.people[0] is not None for photo in photos)
+
+
+WAYS = {
+    "one camera that stands still": [camera_at(0)] * 4,
+    "one camera that moves": [camera_at(angle) for angle in (0, 25, 50, 75)],
+    "a camera for each moment": [camera_at(angle, distance=2 + angle / 100) for angle in (0, 90, 180, 270)],
+}
+
+
+@pytest.mark.parametrize("cameras", WAYS.values(), ids=WAYS)
+@pytest.mark.parametrize("step", [0.0, 0.4, 1.6])
+def test_frames_that_one_view_sees_show_one_person(cameras, step, tmp_path):
+    photos = [seen_at(f"{f}", matrix, moved(BODY, 0.3 * step * f, 0, step * f)) for f, matrix in enumerate(cameras)]
+    photos = same_people(photos, batch(cameras), range(4))
+    assert is_in_every_photo(photos, tmp_path / "s.png") and len(photos[0].people) == 1
+    assert not any("is not where" in line for line in detect.remarks(photos, 0))
+
+
+@pytest.mark.parametrize("step", [0.9, 1.1, 2.5])
+def test_a_person_who_walks_far_between_moments_stays_one_person(step, tmp_path):
+    views = [camera_at(0, distance=9.0), camera_at(70, distance=9.0)]
+    photos = [seen_at(f"{f}{v}", views[v], moved(BODY, step * f, 0, 0)) for f in range(3) for v in range(2)]
+    photos = same_people(photos, batch(views * 3), [0, 0, 1, 1, 2, 2])
+    assert is_in_every_photo(photos, tmp_path / "s.png")
+    assert not any("is not where" in line for line in detect.remarks(photos, 0))
+
+
+@pytest.mark.parametrize("views", [3, 4, 6])
+@pytest.mark.parametrize("turned", [6.0, -12.0])
+def test_a_camera_that_is_off_shows_the_same_person_and_is_named(views, turned, tmp_path):
+    true = [camera_at(360 * v / views + 7 * v) for v in range(views)]
+    photos = [seen_at(f"c{v}", matrix, BODY) for v, matrix in enumerate(true)]
+    wrong = [camera_at(0, turned), *true[1:]]
+    photos = same_people(photos, batch(wrong))
+    assert is_in_every_photo(photos, tmp_path / "s.png")
+    (line,) = [line for line in detect.remarks(photos, 0) if "the calibration is off there" in line]
+    assert line.split(":")[0] == "c0"
+    write_found(tmp_path, photos, 0)
+    assert all(read_grey(tmp_path / "masks" / f"c{v}.png").any() for v in range(views))
+
+
+def test_of_two_cameras_that_do_not_agree_both_are_named(tmp_path):
+    photos = [seen_at(f"c{v}", camera_at(80 * v), BODY) for v in range(2)]
+    photos = same_people(photos, batch([camera_at(0, 9.0), camera_at(80)]))
+    assert is_in_every_photo(photos, tmp_path / "s.png")
+    assert any(line.startswith("c0, c1: the person is not where") for line in detect.remarks(photos, 0))
+
+
+def test_bystanders_of_one_view_do_not_make_the_person_another(tmp_path):
+    views = [camera_at(angle) for angle in (0, 80, 200, 290)]
+    photos = [seen_at(f"c{v}", matrix, BODY) for v, matrix in enumerate(views)]
+    photos[2] = seen_at("c2", views[2], BODY, moved(OTHER_BODY, 1.0, 0, 1.0), areas=(9e3, 9.5e3))
+    photos = same_people(photos, batch(views))
+    assert is_in_every_photo(photos, tmp_path / "s.png") and photos[2].people[0].area == 9e3
+
+
+def test_two_people_are_followed_in_the_photos_of_one_camera(tmp_path):
+    steps = [np.asarray([0.1 * f, 0, 0]) for f in range(4)]
+    photos = [
+        seen_at(f"{f}", camera_at(0), BODY - 0.8 + step, moved(OTHER_BODY, 0.8, 0, 0) - step) for f, step in enumerate(steps)
+    ]
+    photos[2] = dataclasses.replace(photos[2], people=tuple(reversed(photos[2].people)))
+    photos = same_people(photos, batch([camera_at(0)] * 4), range(4))
+    assert [[each.area for each in photo.people] for photo in photos] == [[9e3, 8e3]] * 4
+    with pytest.raises(ValueError, match=r"2 people in 0, 1, 2, 3: expected one\. Person 0 to 1"):
+        choose(photos, None, tmp_path / "s.png")
+    assert choose(photos, 1, tmp_path / "s.png") == 1
+
+
+def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(tmp_path):
+    """Moments from different sides: neither space nor the photo says who is who."""
+    cameras = [camera_at(0), camera_at(180)]
+    photos = [seen_at(f"{f}", matrix, BODY - 0.8, OTHER_BODY + 0.8) for f, matrix in enumerate(cameras)]
+    photos = same_people(photos, batch(cameras), [0, 1])
+    with pytest.raises(ValueError, match=r"2 people in 0, 1: expected one\. Person 0 to 3"):
+        choose(photos, None, tmp_path / "s.png")
+    with pytest.raises(
+        ValueError, match=r"which of the people of .*s\.png is meant\? Their places do not tell: cut these photos"
+    ):
+        choose(photos, 0, tmp_path / "s.png")
+
+
+def test_somebody_else_for_certain_is_not_the_person(tmp_path):
+    """The last view shows only the other one, who is beside the person in the others."""
+    views = [camera_at(angle) for angle in (0, 80, 200)]
+    photos = [seen_at(f"c{v}", matrix, BODY, moved(OTHER_BODY, 0.7, 0, 0.4)) for v, matrix in enumerate(views)]
+    photos[2] = seen_at("c2", views[2], moved(OTHER_BODY, 0.7, 0, 0.4), areas=(8e3,))
+    photos = same_people(photos, batch(views))
+    assert choose(photos, 1, tmp_path / "s.png") == 1
+    assert [photo.people[1] and photo.people[1].area for photo in photos] == [9e3, 9e3, None]
+    assert detect.remarks(photos, 1) == ["c2: the person was not found in it"]
+
+
+def with_masks(photo, corners):
+    people = tuple(each._replace(corner=corner) for each, corner in zip(photo.people, corners, strict=True))
+    return dataclasses.replace(photo, people=people)
+
+
+@pytest.mark.parametrize("kind", ["masks", "keypoints"])
+def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kind, tmp_path):
+    places = [(5, 10), (15, 30)]
+    photos = [with_masks(photo(name, found(1, 90.0), found(2, 80.0)), places) for name in "abc"]
+    meant = [0, 1, 1]
+    masks, points, confidences = np.zeros((3, 30, 40), np.float32), np.zeros((3, 33, 2), np.float32), np.ones((3, 33), np.float32)
+    for v, i in enumerate(meant):
+        (top, left) = places[i]
+        masks[v, top : top + 8, left : left + 4] = 1
+        points[v] = left + 2, top + 3
+    given = masks if kind == "masks" else Keypoints(points, confidences, MEDIAPIPE_33)
+    settled, number = detect.person_of([dataclasses.replace(each, unclear=True) for each in photos], given, tmp_path / "s.png")
+    assert [each.people[number].corner for each in settled] == [places[i] for i in meant]
+    assert not any(each.unclear for each in settled)
+
+
+def test_a_photo_without_keypoints_whose_people_are_rivals_is_asked_about(tmp_path):
+    photos = [dataclasses.replace(photo(name, found(1, 90.0), found(2, 80.0)), unclear=True) for name in "ab"]
+    points = np.full((2, 33, 2), [11.0, 7.0], np.float32)
+    confidences = np.repeat([[1.0], [0.0]], 33, axis=1).astype(np.float32)
+    with pytest.raises(ValueError, match=r"^b: which of the people of .* is meant\? There are no keypoints of the person: add"):
+        detect.person_of(photos, Keypoints(points, confidences, MEDIAPIPE_33), tmp_path / "s.png")
+
+
+@pytest.mark.parametrize("exposure", [0.4, 0.65, 1.25])
+def test_the_exposure_of_a_photo_never_makes_another_person_of_the_person(exposure, tmp_path):
+    light, dark = 0.8, 0.5
+    both = [colored("a", light, dark), colored("b", dark * exposure, light * exposure)]
+    first, second = same_people(both)
+    assert [round(each.person.points[0, 0]) for each in first.people] == [10, 30]
+    assert second.unclear or [round(each.person.points[0, 0]) for each in second.people] == [30, 10]
+    alone = same_people([colored("a", light, dark), colored("b", light * exposure)])
+    assert alone[1].unclear
+    with pytest.raises(ValueError, match=r"^b: which of the people"):
+        choose(alone, 0, tmp_path / "s.png")
 
 
 def test_two_photos_never_share_a_mask(tmp_path):

@@ -23,6 +23,7 @@ from humangs_jax.fitting.triangulation import (
     align_points,
     align_robustly,
     in_order_of_time,
+    match_colors,
     match_people,
     reprojection_errors,
     triangulate,
@@ -384,3 +385,40 @@ def test_people_are_followed_over_time_by_where_they_are():
     assert [m.center[0] for m in a if m] == [0.0, 1.0] and a[2:] == [None, None]
     assert [m.center[0] for m in b if m] == [0.1, 1.2]
     assert later[0].center[0] == 0.2 and later[1] is None and later[2] is alone and later[3].center[0] == 5.0
+
+
+SIDEWAYS = np.asarray([200.0, 0.0, 0.0])
+"""Pixels, and no change of visibility."""
+
+
+def test_whom_space_does_not_link_the_photo_of_one_camera_links():
+    """One view of each moment: two people change their order in the list, and a third comes."""
+    views, _ = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), 1)
+    first, second = views[0].people
+    guest = first + SIDEWAYS
+    shown = [[views[0]], [views[0]._replace(people=(second + 0.05 * SIDEWAYS, guest, first - 0.05 * SIDEWAYS))]]
+    alone = lambda i: Match((i,), (False,), float("inf"), np.full(3, np.nan))
+    matches = [[alone(0), alone(1)], [alone(0), alone(1), alone(2)]]
+    assert [[m and m.members[0] for m in frame] for frame in in_order_of_time(matches, shown)] == [[0, 1, None], [2, 0, 1]]
+    assert len(in_order_of_time(matches)[0]) == 5  # without the photos nobody is linked
+    turned = views[0]._replace(cam_from_world=np.diag([-1.0, 1, -1, 1]) @ views[0].cam_from_world)
+    away = in_order_of_time(matches, [shown[0], [shown[1][0]._replace(cam_from_world=turned.cam_from_world)]])
+    assert len(away[0]) == 5
+
+
+def test_of_two_who_are_as_near_in_the_photo_neither_is_taken():
+    views, _ = seen_in(somebody(0)[None], 1)
+    (row,) = views[0].people
+    shown = [[views[0]], [views[0]._replace(people=(row + 0.1 * SIDEWAYS, row - 0.1 * SIDEWAYS))]]
+    alone = lambda i: Match((i,), (False,), float("inf"), np.full(3, np.nan))
+    assert len(in_order_of_time([[alone(0)], [alone(0), alone(1)]], shown)[0]) == 3
+
+
+@pytest.mark.parametrize("exposure", [0.3, 0.65, 1.0, 1.8])
+def test_colors_match_people_at_any_exposure_or_not_at_all(exposure):
+    rng = np.random.default_rng(0)
+    people = np.asarray([[[0.5, 0.2, 0.2], [0.1, 0.1, 0.3]], [[0.3, 0.5, 0.3], [0.5, 0.45, 0.4]]])
+    seen = people[::-1] * exposure + rng.normal(0, 0.005, people.shape)
+    assert match_colors(people, seen) in ((1, 0), None) and (match_colors(people, seen) or exposure < 0.5)
+    greys = np.full((2, 2, 3), 0.8) * np.asarray([1.0, 0.65])[:, None, None]
+    assert match_colors(greys, greys[:1] * exposure) is None  # a dark photo of the light one, or the dark one

@@ -1,0 +1,218 @@
+"""Who of the people in one photo is who of those in the others.
+
+The person is the only large one of each photo. Where several are large, people of one moment are matched by how well they
+triangulate, over time by where they are, in space or in the photo of one camera. Without calibrated cameras the colors of upper
+body and legs are compared, whatever the exposure. Whoever is matched to nobody may still be the person: only who is in a photo
+together with the person is surely somebody else.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float, Int, UInt
+from humangs_jax.data.keypoints.formats import SeenPerson
+from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.fitting.triangulation import Seen, comparable, in_order_of_time, match_colors, match_people
+from humangs_jax.geometry.camera import Camera
+
+RIVAL = 0.35
+"""Somebody with this share of the pixels of the largest person may be meant as well as he."""
+PARTS = ((11, 12, 24, 23), (23, 24, 26, 25))
+"""Corners of upper body and thighs: landmarks of the left and right."""
+LARGE_PEOPLE = 5
+"""In a photo, at most, that are told apart by their colors."""
+
+
+class Found(NamedTuple):
+    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column). area: pixels of the person.
+    mirrored: left and right were exchanged, as other views show; it is repaired. apart: the landmarks do not meet those of other
+    photos of the moment: the camera is off, or this is somebody else.
+    """
+
+    person: SeenPerson
+    mask: UInt[np.ndarray, "h w"]
+    corner: tuple[int, int]
+    area: float
+    mirrored: bool = False
+    apart: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PhotoPeople:
+    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it.
+    colors: several are large, and colors tell who is who. unclear: they do not.
+    """
+
+    name: str
+    size: tuple[int, int]
+    thumbnail: Float[np.ndarray, "h w 3"]
+    people: tuple[Found | None, ...]
+    colors: bool = False
+    unclear: bool = False
+
+
+def inside_photo(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int) -> Bool[np.ndarray, " n"]:
+    """Tells which pixels are in a photo of this size."""
+    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
+
+
+def same_people(
+    photos: Sequence[PhotoPeople], cameras: Camera | None = None, frames: Sequence[int] | None = None
+) -> list[PhotoPeople]:
+    """The photos with people in such an order that the i-th of each is the same person.
+
+    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or, where several are large, that
+    of colors. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
+    """
+    if cameras is not None and len(photos) > 1:
+        moments = np.asarray([0] * len(photos) if frames is None else frames)
+        rows = _with_only_ones(_matched(photos, cameras, moments), moments)
+    else:
+        photos = _by_colors(photos) if len(photos) > 1 else photos
+        rows = [list(photo.people) for photo in photos]
+    most = max((len(row) for row in rows), default=0)
+    ordered = [
+        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row)))) for photo, row in zip(photos, rows, strict=True)
+    ]
+    order = np.argsort([-area for area in _areas(ordered)], kind="stable")
+    order = [i for i in order if any(photo.people[i] is not None for photo in ordered)]
+    return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
+
+
+def _large(people: Sequence[Found | None]) -> list[int]:
+    """The people of a photo who may be meant as well as its largest."""
+    areas = [0.0 if each is None else each.area for each in people]
+    return [i for i, each in enumerate(people) if each is not None and areas[i] > RIVAL * max(areas)]
+
+
+def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
+    people = zip(*(photo.people for photo in photos), strict=True)
+    return [sum((found.area for found in person if found is not None), 0.0) for person in people]
+
+
+def _by_colors(photos: Sequence[PhotoPeople]) -> Sequence[PhotoPeople]:
+    """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
+    found = [[each for each in photo.people if each is not None] for photo in photos]  # the largest first
+    large = [[people[i] for i in _large(people)][:LARGE_PEOPLE] for people in found]
+    most = max(range(len(photos)), key=lambda v: len(large[v]))
+    if len(large[most]) < 2:
+        return photos
+    first = _colors(photos[most], large[most])
+    ordered = []
+    for photo, people in zip(photos, large, strict=True):
+        order = match_colors(first, _colors(photo, people)) if people else ()
+        if order is None:
+            ordered.append(dataclasses.replace(photo, unclear=True))
+            continue
+        row: list[Found | None] = [None] * len(first)
+        for i, each in zip(order, people, strict=True):
+            row[i] = each
+        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True))
+    return ordered
+
+
+def _colors(photo: PhotoPeople, people: Sequence[Found]) -> Float[np.ndarray, "n parts 3"]:
+    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
+    height, width = photo.thumbnail.shape[:2]
+    u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
+    found = np.full((len(people), len(PARTS), 3), np.nan)
+    for i, each in enumerate(people):
+        for k, part in enumerate(PARTS):
+            a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
+            x, y = np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
+            inside = inside_photo(x, y, width, height)
+            if inside.any():
+                found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
+    return found
+
+
+Row = list[Found | None]
+"""The people of a photo, each at the number of the person."""
+
+
+def _matched(photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]) -> list[Row]:
+    """The people of each photo by number, as far as cameras and time tell who is who."""
+    K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
+    points = [tuple(each.person.points for each in photo.people if each is not None) for photo in photos]
+    times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
+    shown = [[Seen(K[v], transforms[v], points[v]) for v in own] for own in times]
+    matches = [match_people(views, MEDIAPIPE_33.mirror) for views in shown]
+    rows: list[Row] = [[] for _ in photos]
+    for own, people in zip(times, in_order_of_time(matches, shown), strict=True):
+        for match in people:
+            for i, v in enumerate(own):
+                found = None if match is None or (member := match.members[i]) is None else photos[v].people[member]
+                mirrored = found is not None and match is not None and match.mirrored[i]
+                rows[v].append(exchanged(found) if mirrored else found)
+    return rows
+
+
+def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]:
+    """The same where those who are the only large ones of their photos are one person, matched or not.
+
+    Two of whom one photo shows both stay two. So does everybody where somebody else is large in many photos: whoever is alone
+    in a photo may then be either.
+    """
+    alone = {large[0] for large in map(_large, rows) if len(large) == 1}
+    if not alone:
+        return rows
+    totals = [sum(each.area for each in person if each is not None) for person in zip(*rows, strict=True)]
+    first, *others = sorted(alone, key=lambda i: -totals[i])
+    joined, source = [list(row) for row in rows], [first] * len(rows)
+    for i in others:
+        if any(row[first] is not None and row[i] is not None for row in joined):
+            continue
+        for v, row in enumerate(joined):
+            if row[i] is not None:
+                row[first], row[i], source[v] = row[i], None, i
+        totals[first], totals[i] = totals[first] + totals[i], 0.0
+    if any(total > RIVAL * totals[first] for i, total in enumerate(totals) if i != first):
+        return rows
+    return _with_those_apart(joined, first, np.asarray(source), frames)
+
+
+def _with_those_apart(rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]) -> list[Row]:
+    """The same where photos of the person that do not meet the others of their moment are marked, see `Found.apart`.
+
+    Arguments: source: the number that each photo had by its match.
+    """
+    for frame in np.unique(frames):
+        own = [int(v) for v in np.flatnonzero(frames == frame) if rows[v][person] is not None]
+        numbers, counts = np.unique(source[own], return_counts=True)
+        most = numbers[counts == counts.max()] if len(own) else numbers
+        for v in own:
+            others = [rows[w][person] for w in own if source[w] != source[v]]
+            points = [each.person.points for each in others if each is not None]
+            mine = rows[v][person]
+            assert mine is not None
+            if (len(most) > 1 or source[v] != most[0]) and any(comparable(mine.person.points, each) for each in points):
+                rows[v][person] = mine._replace(apart=True)
+    return rows
+
+
+def exchanged(found: Found) -> Found:
+    """The person with left and right exchanged."""
+    order = np.asarray(MEDIAPIPE_33.mirror)
+    person = dataclasses.replace(found.person, points=found.person.points[order], world=found.person.world[order])
+    return found._replace(person=person, mirrored=True)
+
+
+def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
+    """People who may be meant as well as the first, by number."""
+    areas = _areas(photos)
+    return [i for i in range(1, len(areas)) if areas[i] > RIVAL * areas[0]]
+
+
+def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
+    """Tells whether somebody in a photo may be the person who is not known to be in it.
+
+    That is somebody large whom no photo shows together with the person.
+    """
+    people = photos[photo].people
+    if photos[photo].unclear or people[person] is not None:
+        return photos[photo].unclear
+    shown_with = [i for each in photos if each.people[person] is not None for i, one in enumerate(each.people) if one is not None]
+    return any(i not in shown_with for i in _large(people))
