@@ -157,7 +157,7 @@ KEYPOINTS = SourceFormats(
         "OpenPose",
         _KEYPOINTS + "openpose",
         files=("openpose",),
-        content="`--write_json`, a file an image: BODY_25, hands",
+        content="`--write_json`, a file an image: BODY_25, BODY_25B, COCO (18), hands; a list of frames of ControlNet's nodes",
     ),
     easymocap=SourceFormat(
         "EasyMocap", _KEYPOINTS + "easymocap", files=("annots",), content="`annots`, a file an image: BODY_25, hands"

@@ -170,12 +170,20 @@ FAULTS = {
     "scores": ([{"keypoints": [[1, 2]] * 17, "keypoint_scores": [1.0]}], r"keypoint_scores: expected shape \(17,\), got \(1,\)"),
     "frame": ([{"frame_id": "a", "instances": []}], r"\[0\]\.frame_id: expected an integer, got 'a'"),
     "openpose coco": (
-        {"people": [{"pose_keypoints_2d": [1.0] * 54}]},
-        r"people\[0\]\.pose_keypoints_2d: expected 75 numbers of BODY_25, got 54 .*--model_pose BODY_25",
+        {"version": 1.3, "people": [{"pose_keypoints_2d": [1.0] * 45}]},
+        r"people\[0\]\.pose_keypoints_2d: expected 17, 18, 25, 26, 133, 136 points .*, got 15 points of MPI \(OpenPose: ",
+    ),
+    "an animal of another tool": (
+        [{"people": [{"pose_keypoints_2d": [1.0] * 60}], "canvas_width": 320, "canvas_height": 240}],
+        r"\[0\]\.people\[0\]\.pose_keypoints_2d: .*, got 20 points of an animal of ControlNet$",
+    ),
+    "another canvas": (
+        {"people": [{"pose_keypoints_2d": [9.0] * 54}], "canvas_width": 512, "canvas_height": 384},
+        r"size of front: 512 x 384, but the capture's photos have 320 x 240",
     ),
     "openpose body": (
         {"people": [{"pose_keypoints_2d": [1.0] * 57}]},
-        r"people\[0\]\.pose_keypoints_2d: expected a flat list of 75 ",
+        r"people\[0\]\.pose_keypoints_2d: expected 17, 18, .*, got 19 points$",
     ),
     "openpose hand that is an object": (
         {"people": [{"pose_keypoints_2d": [], "hand_left_keypoints_2d": {}}]},
@@ -207,6 +215,8 @@ def test_faults_are_one_line_that_names_the_file(tmp_path, fault):
 def test_shares_of_the_image_are_no_pixels(tmp_path):
     body = np.stack([np.linspace(0.2, 0.8, 25), np.linspace(0, 1, 25), np.ones(25)], axis=1).reshape(-1).tolist()
     with pytest.raises(CaptureError, match=r"expected pixels, not shares of the image \(OpenPose: --keypoint_scale 0\)"):
+        read(tmp_path / "front_keypoints.json", {"version": 1.3, "people": [{"pose_keypoints_2d": body}]})
+    with pytest.raises(CaptureError, match=r"not shares of the image$"):
         read(tmp_path / "front_keypoints.json", {"people": [{"pose_keypoints_2d": body}]})
 
 
@@ -237,7 +247,7 @@ OWN = {"points": np.ones((2, 17, 2)), "confidences": np.ones((2, 17)), "set": np
         ({"names": np.array([{}, {}])}, r"names: a pickled object"),
         (
             {"set": np.array("halpe27")},
-            r"set: expected one of coco17, halpe26, wholebody133, halpe136, openpose67, mediapipe33, got 'halpe27'",
+            r"set: expected one of coco17, halpe26, .*, openpose67, openpose_b67, mediapipe33, got 'halpe27'",
         ),
         ({"points": np.ones((2, 133, 2))}, r"points: expected shape \(2, 17, 2\), got \(2, 133, 2\)"),
         ({"confidences": np.ones((1, 17))}, r"confidences: expected shape \(2, 17\)"),

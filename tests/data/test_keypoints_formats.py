@@ -1,5 +1,6 @@
 """Each format as its tool writes it, from known points, read back exactly; names of views, and sets of points."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -433,3 +434,86 @@ def test_landmarks_of_the_face_mirror_as_in_300w():
     names = COCO_WHOLEBODY_133.names
     for a, b in (*jaw_brows_nose, *eyes_mouth):
         assert COCO_WHOLEBODY_133.mirror[names.index(f"face_{a}")] == names.index(f"face_{b}")
+
+
+# Orders of OpenPose's points ------------------------------------------------------------------------------------------
+
+COCO_18 = (
+    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
+    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"),
+    *("right_eye", "left_eye", "right_ear", "left_ear"),
+)
+TOES = ("left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel")
+ORDERS = {
+    "BODY_25": OPENPOSE_67.names[:25],
+    "BODY_25B": (*COCO_17.names, "upper_neck", "head_top", *TOES),
+    "OpenPose's COCO": COCO_18,
+    "COCO with a neck": (*COCO_17.names, "neck"),
+}
+STANDING = {
+    **{"nose": (150, 40), "left_eye": (154, 36), "right_eye": (146, 36), "left_ear": (160, 38), "right_ear": (140, 38)},
+    **{"left_shoulder": (168, 64), "right_shoulder": (132, 64), "left_elbow": (176, 92), "right_elbow": (122, 90)},
+    **{"left_wrist": (180, 116), "right_wrist": (104, 70), "left_hip": (162, 116), "right_hip": (138, 116)},
+    **{"left_knee": (164, 158), "right_knee": (134, 156), "left_ankle": (164, 200), "right_ankle": (132, 198)},
+    **{"left_big_toe": (168, 206), "left_small_toe": (172, 205), "left_heel": (162, 203)},
+    **{"right_big_toe": (128, 205), "right_small_toe": (124, 204), "right_heel": (133, 202)},
+    **{"neck": (150, 64), "mid_hip": (150, 116), "upper_neck": (150, 56), "head_top": (150, 20)},
+}
+"""Pixels of a person who looks into the camera and raises the right hand."""
+
+
+def standing(order, seen=lambda name: True):
+    """The flat list of OpenPose, in an order, of the points that are seen."""
+    points = [(*STANDING[name], 0.8) if seen(name) else (0, 0, 0) for name in ORDERS[order]]
+    return [float(number) for point in points for number in point]
+
+
+def assert_named(keypoints, seen=lambda name: True):
+    """Points have the places of their names."""
+    for view in range(len(keypoints.points)):
+        for name, point, confidence in zip(keypoints.set.names, keypoints.points[view], keypoints.confidences[view], strict=True):
+            if confidence:
+                np.testing.assert_allclose(point - 0.5, STANDING[name], atol=0.51, err_msg=name)
+            else:
+                assert name not in STANDING or not seen(name), name
+
+
+@pytest.mark.parametrize("seen", ["all", "without legs", "without the head", "some"])
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_order_of_openposes_points_is_told_by_where_they_lie(order, seen, tmp_path):
+    hidden = {"all": (), "without legs": ("knee", "ankle", "toe", "heel"), "without the head": ("eye", "ear", "nose", "head")}
+    hidden |= {"some": ("left_elbow", "right_knee", "left_eye", "small_toe")}
+    visible = lambda name: not any(part in name for part in hidden[seen])
+    for name in NAMES:
+        write(tmp_path / f"{name}_keypoints.json", {"version": 1.3, "people": [{"pose_keypoints_2d": standing(order, visible)}]})
+    found = read(tmp_path)
+    assert found.set.name == {"BODY_25": "openpose67", "BODY_25B": "openpose_b67"}.get(order, "openpose60")
+    assert_named(found, visible)
+    assert [line for line in found.warnings if order in line] == list(found.warnings)[: order != "BODY_25"]
+
+
+def test_easymocaps_25_points_may_be_in_either_order_and_keep_their_hands(tmp_path):
+    hand = [[100.0 + i, 50.0, 0.5] for i in range(21)]
+    body = np.reshape(standing("BODY_25B"), (-1, 3)).tolist()
+    annots = {"annots": [{"personID": 0, "keypoints": body, "handl2d": hand, "handr2d": hand}]}
+    found = read(write(tmp_path / "front.json", annots), ("front",))
+    assert_named(dataclasses.replace(found, confidences=found.confidences * (np.arange(67) < 25)))
+    np.testing.assert_array_equal(found.points[0, 25:46] - 0.5, np.asarray(hand)[:, :2])
+
+
+def test_an_order_that_is_not_clear_is_the_usual_one_and_said(tmp_path):
+    few = lambda name: name in ("nose", "left_wrist", "right_wrist", "left_big_toe", "left_eye")
+    for order, line in (("BODY_25B", "taken for BODY_25, not BODY_25B"), ("COCO with a neck", "taken for OpenPose's COCO, not")):
+        people = [{"pose_keypoints_2d": standing(order, few)}]
+        found = read(write(tmp_path / "front.json", {"people": people}), ("front",))
+        assert any("is not clear" in each and line in each for each in found.warnings)
+
+
+def test_frames_of_nodes_are_a_list_of_objects_with_a_canvas(tmp_path):
+    """ControlNet's nodes write such files; hands that were not found are null."""
+    person = {"pose_keypoints_2d": standing("OpenPose's COCO"), "hand_left_keypoints_2d": None, "face_keypoints_2d": None}
+    frames = [{"people": [person], "canvas_width": SIZE[0], "canvas_height": SIZE[1]} for _ in NAMES]
+    assert_named(read(write(tmp_path / "poses.json", frames), ("0", "1", "2")))
+    assert_named(read(write(tmp_path / "front.json", frames[:1]), ("front",)))
+    nobody = {"people": [{"pose_keypoints_2d": None}], "canvas_width": SIZE[0], "canvas_height": SIZE[1]}
+    assert read(write(tmp_path / "poses.json", [*frames[:2], nobody]), ("0", "1", "2")).missing == ("2",)

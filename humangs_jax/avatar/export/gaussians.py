@@ -23,6 +23,7 @@ from humangs_jax.avatar.export import EXPORTS, OTHERS, ExportFormat, Up, chosen_
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import BOUNDED, LARGEST, check_values, checked_arguments, require_concrete
+from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.registry import alternatives, imported
 from humangs_jax.data.motion import Motion, grounded
@@ -157,7 +158,7 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
         said: list[str] = []
         gaussians = imported(form.reader)(data, said)
         if said:
-            logger.warning("%s: %s", path, "; ".join(dict.fromkeys(said)))
+            logger.warning("%s: %s", path, printable("; ".join(dict.fromkeys(said))))
         return _between_worlds(gaussians, form) if y_up else gaussians
 
 

@@ -24,6 +24,7 @@ from humangs_jax.data.formats import SourceFormat
 from humangs_jax.data.keypoints.keypoints import (
     KEYPOINT_SETS,
     MEDIAPIPE_33,
+    OPENPOSE_60,
     OPENPOSE_67,
     SETS_BY_COUNT,
     DetectedImage,
@@ -181,32 +182,60 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
 
 SUFFIX = "_keypoints"
 """What OpenPose adds to the name of the image."""
-OPENPOSE_PARTS = {"pose_keypoints_2d": 25, "hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
+HANDS_OF_OPENPOSE = {"hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
 """The face, if it is there, is not read."""
-OTHER_MODELS = (3 * 15, 3 * 18, 3 * 135)
-"""Numbers of a person of MPI, COCO and BODY_135."""
+BODY, BODY_POINTS = "pose_keypoints_2d", (25, 18)
+"""Of the body: the models BODY_25 and BODY_25B, and COCO."""
+OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
+"""What has other numbers of points."""
 
 
 def recognizes_openpose(source: Source) -> bool:
-    """Whether a file is a JSON object with people."""
-    return isinstance(source.json, dict) and "people" in source.json
+    """Whether a file is a JSON object with people, or a list of such."""
+    frames = source.json if isinstance(source.json, list) else [source.json]
+    return bool(frames) and all(isinstance(frame, dict) and "people" in frame for frame in frames)
 
 
 def read_openpose(source: Source, format: SourceFormat) -> Detections:
-    """The people of one image. Raises: CaptureError."""
-    (entries,) = members(source.json, source.path, people=list)
-    people = tuple(_openpose_person(entry, source.path, f"people[{i}]") for i, entry in enumerate(entries))
-    return detections_of([DetectedImage(source.name.removesuffix(SUFFIX), source.path, people)], OPENPOSE_67)
+    """The people of one image, or of the frames of a video, which programs with nodes write as a list. Raises: CaptureError."""
+    listed, frames = isinstance(source.json, list), source.json
+    frames = frames if listed else [frames]
+    own = not any("canvas_width" in frame for frame in frames) and any("version" in frame for frame in frames)
+    images = []
+    for i, frame in enumerate(frames):
+        field = f"[{i}]." if listed else ""
+        (entries,) = members(frame, source.path, field.rstrip("."), people=list)
+        people = tuple(_openpose_person(each, source.path, f"{field}people[{j}]", own) for j, each in enumerate(entries))
+        people = people if any(person.any() for person in people) else ()
+        name: str | int = source.name.removesuffix(SUFFIX)
+        if len(frames) > 1:
+            name = i if source.alone else f"{name}/{i}"
+        images.append(DetectedImage(name, source.path, people, _canvas(frame, source.path)))
+    found = detections_of(images, OPENPOSE_67, OPENPOSE_60)
+    return dataclasses.replace(found, tool="OpenPose" if own else "")
 
 
-def _openpose_person(person: Any, file: Path, field: str) -> Float[np.ndarray, "k 3"]:
-    (body,) = members(person, file, field, pose_keypoints_2d=list)
-    if len(body) % 3 == 0 and len(body) // 3 in SETS_BY_COUNT:
-        return triples(body, file, f"{field}.pose_keypoints_2d")
-    if len(body) in OTHER_MODELS:
-        problem = f"expected 75 numbers of BODY_25, got {len(body)} of another model (OpenPose: --model_pose BODY_25)"
-        raise CaptureError(file, f"{field}.pose_keypoints_2d", problem)
-    return _parts(person, OPENPOSE_PARTS, file, field)
+def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
+    """Width and height of the image that the points are of, where the file says so."""
+    width, height = frame.get("canvas_width"), frame.get("canvas_height")
+    return None if width is None or height is None else _stated_size({"width": width, "height": height}, file)
+
+
+def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np.ndarray, "k 3"]:
+    """own: OpenPose has written it."""
+    if expect(person, dict, file, field).get(BODY) is None:
+        person = person | {BODY: []}
+    (body,) = members(person, file, field, **{BODY: list})
+    count, rest = divmod(len(body), 3)
+    if not rest and count in SETS_BY_COUNT:
+        return triples(body, file, f"{field}.{BODY}")
+    if rest or (count and count not in BODY_POINTS):
+        model = f" of {OTHER_MODELS[count]}" if not rest and count in OTHER_MODELS else ""
+        found = f"{len(body)} numbers" if rest else f"{count} points{model}"
+        known = ", ".join(map(str, sorted((*BODY_POINTS, *SETS_BY_COUNT))))
+        hint = " (OpenPose: --model_pose BODY_25)" if own else ""
+        raise CaptureError(file, f"{field}.{BODY}", f"expected {known} points of x, y, confidence, got {found}{hint}")
+    return _parts(person, {BODY: count or BODY_POINTS[0], **HANDS_OF_OPENPOSE}, file, field)
 
 
 def _parts(person: dict[str, Any], counts: dict[str, int], file: Path, field: str) -> Float[np.ndarray, "k 3"]:

@@ -3,7 +3,7 @@
 The names of points, for `side` left or right (the person's own):
 
 nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
-    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe)
+    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe and BODY_25B); upper_neck (BODY_25B)
 `side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
 face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
 `side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
@@ -124,6 +124,17 @@ HALPE_136 = _keypoint_set(
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
+OPENPOSE_60 = _keypoint_set(
+    "openpose60",
+    (*_BODY_25[:8], *_BODY_25[9:19], *hand_names("left"), *hand_names("right")),
+)
+"""The 18 points of OpenPose's COCO model with both hands."""
+
+OPENPOSE_67B = _keypoint_set(
+    "openpose_b67", (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right"))
+)
+"""OpenPose's BODY_25B with its left and right hand. Files do not say which of both they have, see `orders`."""
+
 # millimetres. The mean over 12 synthetic people (`python -m experiments landmark_places`); those of hips, wrists, knees,
 # ankles and feet are the mean of these and of a barefoot man's, since synthetic people wear shoes
 _MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
@@ -160,7 +171,8 @@ MEDIAPIPE_33 = _keypoint_set(
 )
 """MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
 
-KEYPOINT_SETS = {each.name: each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_67, MEDIAPIPE_33)}
+_DETECTORS = (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136, OPENPOSE_60, OPENPOSE_67, OPENPOSE_67B, MEDIAPIPE_33)
+KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
 """The sets by name, as our npz files name them."""
 SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)}
 """The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
@@ -212,12 +224,15 @@ class DetectedImage:
 class Detections:
     """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at +0.5.
 
-    set: None if no image has a person.
+    set: None if no image has a person. warnings: what is to be said, a line each. tool: that has written the files, where they
+    say so.
     """
 
     set: KeypointSet | None
     images: tuple[DetectedImage, ...]
     offset: float = HALF_PIXEL
+    warnings: tuple[str, ...] = ()
+    tool: str = ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,16 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.data.capture_checks import CaptureError, few
 from humangs_jax.data.formats import KEYPOINTS
-from humangs_jax.data.keypoints.keypoints import COCO_17, DetectedImage, Detections, Keypoints, Source
+from humangs_jax.data.keypoints.keypoints import (
+    COCO_17,
+    OPENPOSE_60,
+    OPENPOSE_67,
+    DetectedImage,
+    Detections,
+    Keypoints,
+    Source,
+)
+from humangs_jax.data.keypoints.orders import in_order
 from humangs_jax.io.reading import check_limit, reading, walk
 
 NORMALIZED = 2.0
@@ -31,6 +40,8 @@ FAR_OUTSIDE = 0.5
 """Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
 LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
+UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
+"""Sets whose files may be of another one with as many points, and their points of the body."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
 
 
@@ -62,7 +73,11 @@ def read_detections(path: Path) -> Detections:
             if what != known[0]:
                 problem = f"{what}, but {known[1].name} has {known[0]}: expected one set of one tool"
                 raise CaptureError(file, "", problem)
-    return Detections(None, tuple(images)) if known is None else dataclasses.replace(known[2], images=tuple(images))
+    if known is None:
+        return Detections(None, tuple(images))
+    detections = dataclasses.replace(known[2], images=tuple(images))
+    count = UNSORTED.get(detections.set.name if detections.set else "")
+    return detections if count is None or files[0].suffix == ".npz" else in_order(detections, count)
 
 
 def _amount(content: Any) -> int:
@@ -136,7 +151,8 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         raise CaptureError(path, "", f"{problem}: expected keypoints of these photos")
     if np.abs(points[confidences > 0]).max() < NORMALIZED:
         problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
-        raise CaptureError(path, "", f"{problem} (OpenPose: --keypoint_scale 0)")
+        hint = " (OpenPose: --keypoint_scale 0)" if detections.tool else ""
+        raise CaptureError(path, "", problem + hint)
     shifted = _shifted(images, names)
     lines = (
         (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
@@ -146,7 +162,8 @@ def _read(path: Path, names: Sequence[str], width: int, height: int, person: int
         (far, f"{far} keypoints lie far outside of their photo and are ignored: of photos of another size?"),
     )
     world = values[..., 3:].astype(np.float32) if columns > 3 else None
-    return Keypoints(points, confidences, kind, missing, world, tuple(line for found, line in lines if found))
+    said = (*detections.warnings, *(line for found, line in lines if found))
+    return Keypoints(points, confidences, kind, missing, world, said)
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
