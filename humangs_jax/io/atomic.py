@@ -59,15 +59,14 @@ def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) 
 def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], object]]) -> None:
     """Calls write(temporary) for each path, which makes that file; then all are renamed to their paths at once.
 
-    If one of them cannot be written, none appears. Temporary names have the same suffix.
+    If one of them cannot be written, none appears. Temporary names have the same suffix. Folders that do not exist are made.
 
-    Raises: FileNotFoundError if a folder does not exist; OSError, naming the path, if it cannot be written; what `write` raises.
+    Raises: OSError, naming the path, if it cannot be written; what `write` raises.
     """
     temporaries: dict[Path, Path] = {}
     with contextlib.ExitStack() as unfinished:
         for path, write in ((Path(path), write) for path, write in writers.items()):
-            if not path.parent.is_dir():
-                raise FileNotFoundError(f"{path.parent}: no such folder")
+            unfinished.enter_context(_made_folder(path.parent))
             _sweep(path.parent.resolve())
             temporaries[path] = temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
             unfinished.enter_context(_unfinished(temporary))
@@ -77,6 +76,23 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
             for path, temporary in temporaries.items():
                 with _naming(path, temporary):
                     temporary.replace(path)
+
+
+@contextlib.contextmanager
+def _made_folder(folder: Path) -> Generator[None]:
+    """Makes a folder with those above it; they go again if nothing was written into them."""
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise NotADirectoryError(f"{folder}: is no folder, or lies in a file") from error
+    try:
+        yield
+    except BaseException:
+        for each in new:  # the innermost first
+            with contextlib.suppress(OSError):
+                each.rmdir()
+        raise
 
 
 def replace_folder(folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str) -> None:

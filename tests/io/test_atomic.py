@@ -92,8 +92,18 @@ def test_writes_replace_and_leave_nothing_temporary(tmp_path):
     assert (tmp_path / "deep" / "folder" / "b" / "c" / "a.txt").read_text() == "four"
     atomic.add_files(tmp_path / "deep" / "new", writes_into("five"))
     assert (tmp_path / "deep" / "new" / "a.txt").read_text() == "five"
-    with pytest.raises(FileNotFoundError, match="no such folder"):
-        atomic.write_text(tmp_path / "none" / "file.txt", "text")
+    atomic.write_text(tmp_path / "none" / "yet" / "file.txt", "text")
+    assert (tmp_path / "none" / "yet" / "file.txt").read_text() == "text" and names(tmp_path / "none" / "yet") == ["file.txt"]
+    with pytest.raises(NotADirectoryError, match=r"file\.txt: is no folder, or lies in a file"):
+        atomic.write_text(tmp_path / "file.txt" / "b.txt", "text")
+
+
+def test_a_folder_that_was_made_for_a_file_that_failed_goes_again(tmp_path):
+    (tmp_path / "there").mkdir()
+    for place in ("new/and/deep/a.txt", "there/new/a.txt", "there/a.txt"):
+        with pytest.raises(ZeroDivisionError):
+            atomic.replace_file(tmp_path / place, lambda temporary: temporary.write_text(str(1 / 0)))
+    assert names(tmp_path) == ["there"] and not names(tmp_path / "there")
 
 
 @pytest.mark.parametrize("renames", [0, 1])

@@ -99,6 +99,6 @@ def test_half_precision_keeps_metres(tmp_path):
     assert (tmp_path / "half.exr").stat().st_size < (tmp_path / "float.exr").stat().st_size
 
 
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such folder"):
-        write_exr(tmp_path / "nowhere" / "a.exr", [make_view(0)])
+def test_a_missing_folder_is_made(tmp_path):
+    write_exr(tmp_path / "new" / "a.exr", [make_view(0)])
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.exr"]
