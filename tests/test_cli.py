@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import inspect
 import logging
 import re
 import shlex
@@ -41,6 +42,27 @@ def test_every_command_explains_itself(command, humangs):
         cli._parsed(shlex.split(line)[1:])
     shown = set(re.findall(r"^.? (--[a-z][\w-]*)", out, re.MULTILINE))  # with boxes or without
     assert shown == options.option_names(cli._command(command))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_a_switch_that_is_on_says_what_typing_it_does(command, humangs):
+    """`--no-x` is what can be typed: its line says what it does, and the field itself what the switch does."""
+    _, out, _ = humangs(command, "--help")
+    shown = " ".join(re.sub("[\u2500-\u257f]", " ", out).split())
+    source = inspect.getsource(cli._command(command))
+    for field, hint in options.fields_of(cli._command(command)):
+        if field.default is not True:
+            continue
+        (off,) = [each.help for each in hint.__metadata__ if getattr(each, "help", None)]
+        assert off.startswith("Do not ") and f"--no-{field.name.replace('_', '-')} {off}" in shown
+        (about,) = re.findall(rf'^    {field.name}: .*\n    """(.*)"""', source, re.MULTILINE)
+        assert not re.match(r"(do not|no|not|without|skip|take|leave|print)\b", about, re.IGNORECASE), about
+
+
+def test_the_package_runs_as_a_module():
+    run = [sys.executable, "-m", "humangs_jax", "--version"]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == (f"humangs_jax {__version__}\n", "")
 
 
 def test_the_usage_of_an_import_can_be_typed_as_it_stands(humangs):
@@ -275,12 +297,12 @@ def test_what_libraries_say_stays_off_the_screen(verbose):
 def test_help_and_checks_of_places_import_nothing_heavy(tmp_path):
     code = (
         "import sys; from humangs_jax import cli; print(cli.overview())\n"
-        "for words in (['reconstruct', 'x', '--out', 'no/a.npz'], ['refine', 'x', 'y', '--out', 'no/a.npz'],"
+        "for words in (['reconstruct', 'x', '--out', 'a.zip'], ['refine', 'x', 'y', '--out', 'a.zip'],"
         " ['check', 'x', '--out', 'a.npz'], ['convert', 'x', '--out', 'a.npz'], ['demo', '--size', '0'],"
         " ['synth', '--workers', '0'],"
         " ['fit', 'x', '--keypoints', 'k', '--out', '.'], ['import', 'cameras', 'c', '--images', 'i', '--out', '.'],"
-        " ['start', 'p', '--out', '.'], ['train', '--on-the-fly', '-1'], ['animate', 'x', '--out', 'no/a.mp4'],"
-        " ['render', 'x', '--size', '0'], ['export', 'x', '--out', 'no/a.ply']):\n"
+        " ['start', 'p', '--out', '.'], ['train', '--on-the-fly', '-1'], ['animate', 'x', '--out', 'a.txt'],"
+        " ['render', 'x', '--size', '0'], ['export', 'x', '--out', 'a.zip']):\n"
         "    assert cli.execute(words) == cli.BAD_USAGE, words\n"
         "assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
     )

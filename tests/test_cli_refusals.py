@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from typing import get_type_hints
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,8 @@ from small import random_gaussians, small_avatar
 from humangs_jax import cli
 from humangs_jax.avatar import reconstruct as many
 from humangs_jax.avatar.export.gaussians import save_gaussians
+from humangs_jax.cli import options
+from humangs_jax.core.configuration import marks_in
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.io.images import write_png
@@ -120,6 +123,19 @@ BAD_USAGE = {
     "render splats.ply --exr": "--exr: splats.ply is no avatar",
     "render splats.ply --camera transforms.json --out x.mp4": "--camera: expected a folder",
     "render me.npz --preset best --config x.json": "does not go with --preset best",
+    "animate": "AVATAR is missing, as in `humangs animate avatar.npz",
+    "start": "PHOTOS and --out PATH are missing, as in `humangs start photos --out me",
+    "import cameras": "SOURCE, --images PATH and --out PATH are missing, as in `humangs import cameras ",
+    "animate me.npz three.npz": "three.npz: not expected here, as in `humangs animate avatar.npz",
+    "animate me.npz --size abc": "--size abc: expected a whole number, such as --size 512",
+    "animate me.npz --size": "--size: expected a whole number after it",
+    "animate me.npz --turn=much": "--turn much: expected a number, such as --turn 0.0",
+    "render me.npz --views 2.5": "--views 2.5: expected a whole number",
+    "reconstruct someone --views some": "--views some: expected a whole number or auto",
+    "demo --preset qualty": "--preset qualty: expected one of realtime, balanced, quality or best: did you mean quality?",
+    "export me.npz --up x": "--up x: expected one of y, -y or z",
+    "import cameras c --images i --out new --up -y": "--up: expected a value after it, as in --up=-y",
+    "preprocess thumam in --out x --body b.npz": "KIND thumam: expected one of thuman, thuman4, avatarrex,",
     "tune someone": "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them",
     "tune someone --frame-ms -1": "--frame-ms -1.0: expected a positive number",
     "tune someone --frame-ms 9 --out tuned.txt": "--out tuned.txt: expected a name ending in .json",
@@ -130,7 +146,6 @@ BAD_USAGE = {
     "view me.npz --port 99999": "--port 99999",
     "view me.npz --capture demo_capture": "--capture: only with --live",
     "export me.npz --out x.ply --frame 1": "--frame 1: expected --motion and --out",
-    "export me.npz --html no/p.html": "--html no/p.html: the folder no does not exist",
     "export me.npz --html x.html --motion jump.npz --frames :": "--frames :: expected --motion and --out",
     "export me.npz --out x.ply --motion jump.npz --frame 1 --frames :": "--frame 1: does not go with --frames",
     "export me.npz --out x.glb --mesh --motion jump.npz --frame 1": "a file that holds the whole motion",
@@ -149,9 +164,8 @@ BAD_USAGE = {
     "train": "nobody to train on",
     "reconstruct someone --refine soon --out a.npz": "--refine 'soon': expected how long",
     "reconstruct bare --no-check --refine 15s --out a.npz": "--refine 15s: needs masks",
-    "reconstruct someone --out no/such/folder.npz": "--out no/such/folder.npz: the folder no/such does not exist",
     "reconstruct x --out folder.npz": "--out folder.npz: is a folder: expected the name of a file",
-    "reconstruct x --out file.npz/a.npz": "--out file.npz/a.npz: the folder file.npz is no folder",
+    "reconstruct x --out file.npz/a.npz": "--out file.npz/a.npz: file.npz is no folder",
     "reconstruct x --out a.zip": "--out a.zip: expected a name ending in .npz",
     "reconstruct x --out body.npz": "--out body.npz: exists and is no avatar",
     "reconstruct x --out /proc/a.npz": "--out /proc/a.npz: cannot write to /proc",
@@ -192,6 +206,37 @@ def test_what_cannot_be_meant_is_one_line_before_the_work(line, expected, said, 
     assert err.count("\n") == 1 and err.startswith("humangs: error: ") and said in err and out == "", (out, err)
     assert code == expected and (expected == cli.BAD_DATA or said[:2] != "--" or f"error: {said}" in err)
     assert contents(things) == before
+
+
+FOLDERS = {
+    "export three.npz --out new/deep/a.ply": "new/deep/a.ply",
+    "export three.npz --out new/deep/a.obj": "new/deep/a.obj",
+    "export three.npz --html new/deep/page.html": "new/deep/page.html",
+    "export three.npz --motion steps.npz --out new/deep/a.ply --frames :": "new/deep/a_0003.ply",
+}
+
+
+@pytest.mark.parametrize("line", FOLDERS)
+def test_the_folder_of_results_is_made(line, things, tmp_path, monkeypatch, humangs):
+    for name in ("three.npz", "steps.npz"):
+        shutil.copy(things / name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, _, err = humangs(*line.split())
+    assert code == 0 and (tmp_path / FOLDERS[line]).is_file(), err
+
+
+def places(command):
+    """The options of a command that say where a file goes, with a suffix that it may have."""
+    hints = get_type_hints(command, include_extras=True)
+    found = {name: marks_in(hint, options.Place) for name, hint in hints.items()}
+    return {name: place.suffixes[0] for name, marks in found.items() for place in marks if place.suffixes}
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_places_in_folders_that_do_not_exist_are_accepted_by_every_command(name, tmp_path):
+    for suffix in places(cli._command(name)).values():
+        options.require_file(tmp_path / "new" / "deep" / f"a{suffix}", (suffix,))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, monkeypatch, humangs):

@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def execute(arguments: Sequence[str]) -> int:
-    """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help and what tyro refuses."""
+    """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help."""
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import check_options
     from humangs_jax.core import progress
@@ -128,19 +128,20 @@ def _prepare(verbose: bool) -> None:
 def _parsed(arguments: list[str]) -> Command:
     """The command with its options. Only its own module is imported, and only its options are looked at: that is faster.
 
-    Raises: SystemExit after --help, or for options that tyro refuses; UsageError for an unknown command.
+    Raises: SystemExit after --help; UsageError for an unknown command, or words that it does not take.
     """
     from humangs_jax.core.progress import say
 
     if not arguments or arguments[0] in ("--help", "-h"):
         say(overview())
         raise SystemExit(0 if arguments else BAD_USAGE)
-    import tyro
-
     from humangs_jax.cli.options import UsageError, described, option_names
+    from humangs_jax.cli.parsing import parsed
 
     name, *options = arguments
     if name == "--tyro-print-completion" or name == "--tyro-write-completion":
+        import tyro
+
         every = {each: described(_command(each)) for each in COMMANDS}
         return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", args=arguments)  # ty: ignore[no-matching-overload]
     if name not in COMMANDS:
@@ -154,12 +155,11 @@ def _parsed(arguments: list[str]) -> Command:
         if option.startswith("--") and option not in known:
             near = difflib.get_close_matches(option, known, n=1)
             raise UsageError(f"{option}: no option of humangs {name}{f': did you mean {near[0]}?' if near else ''}")
-    prog = " ".join(["humangs", *arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1]])
+    typed = " ".join(arguments[: 2 if arguments[:2] == ["import", "cameras"] else 1])
     try:
-        return tyro.cli(command, prog=prog, args=options, config=(tyro.conf.FlagCreatePairsOff,))
-    except SystemExit as end:
-        if not end.code:
-            say("\n".join(["examples:", *(f"  {example}" for example in command.examples)]))
+        return parsed(command, typed, options)
+    except SystemExit:
+        say("\n".join(["examples:", *(f"  {example}" for example in command.examples)]))
         raise
 
 

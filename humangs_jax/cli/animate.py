@@ -8,7 +8,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.avatar.export import EXPORTS, OTHERS, VIDEOS
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings
+from humangs_jax.cli.options import WHOLE, PartOfMotion, Place, Preset, UsageError, chosen_settings, off
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
@@ -49,8 +49,8 @@ class Animate:
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
-    follow: bool = True
-    """The camera stands still and sees everywhere that the person goes."""
+    follow: Annotated[bool, off("follow the person: the camera stands still and sees everywhere that the person goes")] = True
+    """The camera goes along with the person."""
     fps: Annotated[float | None, RATE] = None
     """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
     start: float = 0.0
@@ -221,8 +221,8 @@ class View:
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     port: Annotated[int, Range(0, 65535)] = 0
     """Port on 127.0.0.1; 0 for any free one."""
-    browser: bool = True
-    """Print the address, and open no browser."""
+    browser: Annotated[bool, off("open a browser; the address is printed")] = True
+    """Open a browser."""
     live: bool = False
     """Follow a training run or an avatar file that is being refined."""
     capture: Path | None = None

@@ -18,6 +18,7 @@ from humangs_jax.cli.options import (
     UsageError,
     chosen_settings,
     first_refinement,
+    off,
     refine_limits,
     require_file,
     require_place,
@@ -108,10 +109,10 @@ class Reconstruct:
     """Captures that the network reads at once. Default: 8."""
     shard: str = "0/1"
     """I/N: the I-th of N parts of the captures, counted from 0, for job arrays."""
-    fit_masks: bool = True
-    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
-    check: bool = True
-    """Skip the quick check of whether photos, cameras and poses belong together."""
+    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    """Move masks that are too large or too small to the edges in the photos."""
+    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = True
+    """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
         limits = first_refinement(self.refine)
@@ -223,10 +224,10 @@ class Refine:
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     live: bool = False
     """Write the avatar so far to --out now and then, for `humangs view --live`."""
-    fit_masks: bool = True
-    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
-    check: bool = True
-    """Skip the quick check of whether photos, cameras and poses belong together."""
+    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    """Move masks that are too large or too small to the edges in the photos."""
+    check: Annotated[bool, off("check first whether photos, cameras and poses belong together")] = True
+    """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")

@@ -86,6 +86,13 @@ class Place:
 
 
 AVATAR = Place((".npz",), avatar=True)
+
+
+def off(what: str) -> Any:
+    """Annotation of a switch that is on: what --no-SWITCH does not do. `--help` shows this, since that is what can be typed."""
+    return arg(help=f"Do not {what}.")
+
+
 _VALUES = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 
 
@@ -127,6 +134,15 @@ def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, 
         hint = hints[field.name]
         kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
         yield field, hint, kind, Positional in getattr(hint, "__metadata__", ())
+
+
+def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
+    """Each field of a command with its annotation, those of groups of options among them."""
+    for field, hint, kind, _ in _options(command):
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            yield from fields_of(kind)
+        else:
+            yield field, hint
 
 
 def _value_shown(kind: Any) -> str | None:
@@ -177,14 +193,18 @@ def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = 
 
 
 def require_file(path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()) -> None:
-    """A file with one of the suffixes can be written to that path. read: what the command reads. Raises: UsageError."""
+    """A file with one of the suffixes can be written to that path, whose folder is made if it does not exist.
+
+    read: what the command reads. Raises: UsageError.
+    """
     if path.suffix.lower() not in suffixes:
         raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder: expected the name of a file")
-    if not path.parent.is_dir():
-        wrong = "is no folder" if path.parent.exists() else "does not exist"
-        raise UsageError(f"{option} {path}: the folder {path.parent} {wrong}")
+    above = next(parent for parent in path.absolute().parents if parent.exists())
+    if not above.is_dir():
+        inside = next(parent for parent in path.parents if parent.absolute() == above)
+        raise UsageError(f"{option} {path}: {inside} is no folder")
     if path.exists() and not path.is_file():
         raise UsageError(f"{option} {path}: is no regular file: expected the name of a file")
     for each in read:

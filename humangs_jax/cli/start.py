@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 from humangs_jax.cli.captures import keypoints_of, tell_found
-from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, require_replaceable, tell_deleted
+from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, off, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
@@ -57,12 +57,12 @@ class Start:
     """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
     without_masks: bool = False
     """Use no masks: the photos have nothing but white behind the person."""
-    fit_masks: bool = True
-    """Take masks as they are. By default, masks that are too large or too small are moved to the edges in the photos."""
+    fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
+    """Move masks that are too large or too small to the edges in the photos."""
     refine: str | None = None
     """Fit the avatar to the photos for so long: 15s, 100steps, or 0. Default, with masks: iterations and the head."""
-    browser: bool = True
-    """Do not open the page at the end."""
+    browser: Annotated[bool, off("open the page at the end")] = True
+    """Open the page at the end."""
     overwrite: bool = False
     """Start again, also where --out already has a body or a finished avatar."""
 

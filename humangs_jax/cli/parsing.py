@@ -1,0 +1,148 @@
+"""Words of a command line to a command with its options. What tyro refuses in a box with its help is one line here."""
+
+import contextlib
+import difflib
+import io
+import os
+import re
+import shlex
+from collections.abc import Generator, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from humangs_jax.cli.options import UsageError, fields_of, option_of
+
+NUMBERS = {int: "a whole number", float: "a number"}
+WIDE = "10000"
+"""Columns of the screen while tyro parses: its messages are not broken into lines."""
+FRAMES = re.compile("[\u2500-\u257f]+|-{3,}")
+"""What boxes are drawn with, or rules where the terminal knows ASCII only."""
+
+
+def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
+    """The command with its options. name: as it is typed. Raises: UsageError; SystemExit after --help."""
+    import tyro
+
+    asked_for_help = "--help" in words or "-h" in words
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.nullcontext() if asked_for_help else _wide_screen():
+            return tyro.cli(command, prog=f"humangs {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(_one_line(command, name, words, _inside(said.getvalue()))) from None
+
+
+def _inside(box: str) -> list[str]:
+    """The lines with words, without the box around them; their indents stay."""
+    lines = [FRAMES.sub("", line).rstrip() for line in box.splitlines()]
+    return [line for line in lines if line]
+
+
+@contextlib.contextmanager
+def _wide_screen() -> Generator[None]:
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = WIDE
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
+
+
+def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[str]) -> str:
+    """What is wrong with the words, after what tyro says in these lines."""
+    text = " ".join(line.strip() for line in lines)
+    example = f"as in `{command.examples[0]}`"
+    if match := re.search(r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text):
+        return _wrong_value(command, match["option"], match["given"])
+    if match := re.search(r"Error parsing (?P<option>[\w-]+): ", text):
+        return _wrong_value(command, match["option"], _value_after(words, match["option"]))
+    if match := re.search(r"Missing value for argument '(?P<option>.*?)'", text):
+        return _no_value(command, match["option"], words)
+    if match := re.search(r"Unrecognized options: (?P<given>.*?) (For full|$)", f"{text} "):
+        return f"{match['given']}: not expected here, {example}"
+    if "Missing from" in text:
+        missing = _missing(lines)
+        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if missing[1:] else missing)
+        return f"{listed} {'are' if missing[1:] else 'is'} missing, {example}"
+    plain = re.sub(r"For full helptext.*", "", text).strip()
+    return f"{plain}: `humangs {name} --help` lists the options, {example}"
+
+
+def _missing(lines: Sequence[str]) -> list[str]:
+    """The arguments that tyro lists with their help: those that are indented least below the first line."""
+    start = next(i for i, line in enumerate(lines) if "Missing from" in line)
+    rows = lines[start + 1 :]
+    indents = [len(row) - len(row.lstrip()) for row in rows]
+    end = next((i for i, row in enumerate(rows) if "For full helptext" in row), len(rows))
+    return [row.strip() for row, indent in zip(rows[:end], indents, strict=False) if indent == min(indents[:end])]
+
+
+def _value_after(words: Sequence[str], option: str) -> str:
+    """What was given to an option, or the text of a positional argument that is not known."""
+    for i, word in enumerate(words):
+        typed, _, value = word.partition("=")
+        if typed.replace("_", "-") == option:
+            return value or " ".join(words[i + 1 : i + 2])
+    return ""
+
+
+def _wrong_value(command: type[Any], option: str, given: str) -> str:
+    choices = _choices(_kind(command, option))
+    near = difflib.get_close_matches(given, choices, n=1)
+    hint = f": did you mean {shlex.quote(near[0])}?" if near else _usual(command, option)
+    return f"{_shown(option)} {given}: expected {_expected(command, option)}{hint}"
+
+
+def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
+    """An option without a value; what follows it looks like an option, as negative numbers and axes do."""
+    following = words[words.index(option) + 1 :] if option in words else []
+    joined = f", as in {option}={following[0]}" if following and following[0][1:2] not in ("", "-") else ""
+    return f"{option}: expected {_expected(command, option)} after it{joined}"
+
+
+def _usual(command: type[Any], option: str) -> str:
+    """The default of an option that is a number."""
+    usual = next((field.default for field, _ in fields_of(command) if option_of(field.name) == option), None)
+    return f", such as {option} {usual}" if isinstance(usual, int | float) and not isinstance(usual, bool) else ""
+
+
+def _shown(option: str) -> str:
+    return option if option.startswith("-") else option.upper()
+
+
+def _expected(command: type[Any], option: str) -> str:
+    """What the values of an option may be, in words."""
+    kind = _kind(command, option)
+    numbers = [NUMBERS[part] for part in _parts(kind) if part in NUMBERS]
+    words = [*numbers, *_choices(kind)]
+    if not words:
+        return "a value"
+    return words[0] if len(words) == 1 else f"{'' if numbers else 'one of '}{', '.join(words[:-1])} or {words[-1]}"
+
+
+def _kind(command: type[Any], option: str) -> Any:
+    """The type of an option, as it is annotated; None for one that is not known."""
+    plain = option.lstrip("-").replace("_", "-").lower()
+    for field, kind in fields_of(command):
+        if option_of(field.name).lstrip("-") == plain:
+            return kind
+    return None
+
+
+def _parts(kind: Any) -> list[Any]:
+    """The types that a type may be: those of unions, what is annotated, and the items of tuples."""
+    if get_origin(kind) is Annotated:
+        return _parts(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType, tuple):
+        return [part for option in get_args(kind) for part in _parts(option)]
+    return [kind]
+
+
+def _choices(kind: Any) -> list[str]:
+    """The words that an option may be, in their order."""
+    return [str(each) for part in _parts(kind) if get_origin(part) is Literal for each in get_args(part)]
