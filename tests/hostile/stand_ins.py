@@ -203,7 +203,7 @@ def stand_ins(variant):
         "detection.people.available": lambda: False,
         "apps.check._body_image": shown,
         "apps.check.faults": lambda capture: Faults((), (None,) * capture.view_count, (1.0,) * capture.view_count, set()),
-        "apps.check._posed_frames": lambda capture, *_: {0: np.zeros((4, 3))},
+        "apps.check._posed_frames": lambda capture, *_: dict.fromkeys(map(int, capture.frames), np.zeros((4, 3))),
         "apps.start.better_body": lambda _weights, _config, loose, *_: (loose, None),
         "apps.demo.load_weights": lambda *_: (None, tiny()),
         "apps.demo.reconstruct": avatar,
