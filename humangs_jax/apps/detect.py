@@ -15,7 +15,7 @@ import numpy as np
 
 from humangs_jax.apps.same_people import Found, PhotoPeople, inside_photo, is_unclear, rivals, same_people
 from humangs_jax.apps.start import photo_files
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
@@ -74,7 +74,7 @@ def person_in_capture(
     if keypoints is None:
         if photos.masks is None or person is not None or not people[0].people:
             return people, choose(people, person, sheet)
-        return person_of(people, photos.masks, sheet)
+        return person_of(people, list(photos.masks), sheet)
     people, number = person_of(people, keypoints, sheet)
     lost = [
         photo.name
@@ -87,9 +87,11 @@ def person_in_capture(
     return people, number
 
 
-def person_of(
-    photos: Sequence[PhotoPeople], given: Keypoints | Float[np.ndarray, "v h w"], sheet: Path
-) -> tuple[list[PhotoPeople], int]:
+Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
+"""Of the photos, each of its size."""
+
+
+def person_of(photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path) -> tuple[list[PhotoPeople], int]:
     """The photos, and the number of the one whose keypoints or masks these are, which decide in each photo.
 
     Arguments: sheet: see `choose`.
@@ -114,18 +116,18 @@ def person_of(
     return settled, number
 
 
-def _has_any(given: Keypoints | Float[np.ndarray, "v h w"], view: int) -> bool:
+def _has_any(given: Keypoints | Masks, view: int) -> bool:
     return bool(np.any(given.confidences[view] if isinstance(given, Keypoints) else given[view]))
 
 
-def _agreement(found: Found | None, given: Keypoints | Float[np.ndarray, "v h w"], view: int) -> float:
+def _agreement(found: Found | None, given: Keypoints | Masks, view: int) -> float:
     """How much of the keypoints or the mask of a view is on the mask of somebody who was found there."""
     if found is None:
         return 0.0
     mask, (top, left) = found.mask / np.float32(255), found.corner
     height, width = mask.shape
     if not isinstance(given, Keypoints):
-        return float(np.sum(given[view, top : top + height, left : left + width] * mask))
+        return float(np.sum(given[view][top : top + height, left : left + width] * mask))
     x, y = np.floor(given.points[view]).astype(int).T - np.asarray([[left], [top]])
     seen = (given.confidences[view] > 0) & inside_photo(x, y, width, height)
     return float(np.sum(mask[y[seen], x[seen]]))

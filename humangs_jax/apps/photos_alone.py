@@ -15,9 +15,12 @@ import numpy as np
 from humangs_jax.apps import detect
 from humangs_jax.apps.same_people import PhotoPeople, exchanged, same_people
 from humangs_jax.apps.start import photo_files
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
+from humangs_jax.data.calibration.photos import upright_mask
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, PersonViews, cameras_from_person
 from humangs_jax.io.images import DIAGONAL_35MM, focal_length, image_size, resized, write_png
@@ -45,6 +48,7 @@ def import_photos(
     *,
     person: int | None = None,
     height: float | None = None,
+    keypoints: Path | None = None,
     masks: Path | None = None,
     own_masks: bool = True,
     reduce: bool = False,
@@ -52,18 +56,24 @@ def import_photos(
 ) -> PhotosImported:
     """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what is there is replaced.
 
-    Arguments: person: number on people.png, where several may be meant. height: of the person, metres. masks: folder of masks of
-    another program. own_masks: whether the detector's masks are written. reduce: whether large photos may be reduced. also: name
-    -> content of JSON files that appear in the folder together with the capture.
+    Arguments:
+        person: number on people.png, where several may be meant; with `keypoints`, in their file.
+        height: of the person, metres.
+        keypoints: of another program. They choose who is meant in each photo.
+        masks: folder of masks of another program. They choose, too, where neither keypoints nor a number is given.
+        own_masks: whether the detector's masks are written.
+        reduce: whether large photos may be reduced.
+        also: name and content of JSON files that appear with the capture.
     Raises: ValueError (one line) if no camera is found or several people may be meant; as `import_cameras`.
     """
     images, files = photo_files(folder)
+    choice = _Choice(person, keypoints, masks, out)
     with tempfile.TemporaryDirectory() as place:
         if reduce and (smaller := _reduced(images, files, Path(place))):
-            found = _look(Path(place), files, smaller, person, out)
+            found = _look(Path(place), files, smaller, choice)
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
                 return _written(found, Path(place), out, height, None, own_masks, also)
-    return _written(_look(images, files, files, person, out), images, out, height, masks, own_masks, also)
+    return _written(_look(images, files, files, choice), images, out, height, masks, own_masks, also)
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
@@ -90,11 +100,19 @@ class _Looked(NamedTuple):
     seen: PersonViews
 
 
-def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | None, out: Path) -> _Looked:
+class _Choice(NamedTuple):
+    """What says who is meant, see `import_photos`; and the capture folder."""
+
+    person: int | None
+    keypoints: Path | None
+    masks: Path | None
+    out: Path
+
+
+def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
     names = [file.relative_to(images).as_posix() for file in looked_at]
     photos = same_people(detect.detect_photos(names, map(detect.upright, looked_at)))
-    # beside `out`, which a refusal leaves as it is
-    number = detect.choose(photos, person, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
+    photos, number = _chosen(photos, images, files, choice)
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
     known = ((focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size)) for i in shown)
@@ -109,6 +127,21 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], person: int | 
         photos=tuple(names[i] for i in shown),
     )
     return _Looked(photos, number, shown, seen)
+
+
+def _chosen(photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice) -> tuple[list[PhotoPeople], int]:
+    """The photos, and the number of the person. Raises: see `detect.choose`, `detect.person_of`, `read_keypoints`."""
+    # beside the capture folder, which a refusal leaves as it is
+    sheet = choice.out.with_name(f"{choice.out.resolve().name}_{detect.SHEET_FILE}")
+    if choice.keypoints is not None:
+        width, height = np.max([photo.size for photo in photos], axis=0).tolist()  # photos are padded to these
+        views = [Path(photo.name).with_suffix("").as_posix().replace("/", "_") for photo in photos]
+        keypoints = read_keypoints(choice.keypoints, views, width, height, person=choice.person)
+        return detect.person_of(photos, keypoints, sheet)
+    if choice.masks is not None and choice.person is None and photos[0].people:
+        masks = [upright_mask(choice.masks, images, file) > MASK_THRESHOLD for file in files]
+        return detect.person_of(photos, masks, sheet)
+    return photos, detect.choose(photos, choice.person, sheet)
 
 
 def _written(

@@ -166,6 +166,7 @@ class Start:
                 self.out,
                 person=self.person,
                 height=self.height,
+                keypoints=material.keypoints,
                 masks=material.masks,
                 own_masks=own_masks,
                 reduce=not (material.keypoints or material.masks or material.alpha),

@@ -304,7 +304,7 @@ def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kin
         (top, left) = places[i]
         masks[v, top : top + 8, left : left + 4] = 1
         points[v] = left + 2, top + 3
-    given = masks if kind == "masks" else Keypoints(points, confidences, MEDIAPIPE_33)
+    given = list(masks) if kind == "masks" else Keypoints(points, confidences, MEDIAPIPE_33)
     settled, number = detect.person_of([dataclasses.replace(each, unclear=True) for each in photos], given, tmp_path / "s.png")
     assert [each.people[number].corner for each in settled] == [places[i] for i in meant]
     assert not any(each.unclear for each in settled)

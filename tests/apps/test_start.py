@@ -12,7 +12,7 @@ from PIL import Image
 from experiments.your_photos import landmarks_in, write_material
 from humangs_jax import cli
 from humangs_jax.apps import detect, photos_alone, start
-from humangs_jax.apps.detect import Found, PhotoPeople
+from humangs_jax.apps.detect import Found, PhotoPeople, detect_photos
 from humangs_jax.apps.start import better_body, held_out_psnr, look, missing
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.video import write_video
@@ -23,7 +23,7 @@ from humangs_jax.data import capture as capture_module
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import SeenPerson
-from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
+from humangs_jax.data.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import people as blazepose
 from humangs_jax.fitting import fit_capture
@@ -205,6 +205,73 @@ def test_check_compares_a_capture_without_keypoints_with_what_is_found(mine, det
     assert cli.execute(["check", str(DEMO), "--person", "1", "--out", "x.png"]) == 0
     assert "keypoints, median error" in capsys.readouterr().out and Path("x_fit.png").is_file()
     assert not (DEMO / "keypoints.json").exists()
+
+
+@pytest.fixture
+def two_people(mine, detected, monkeypatch):
+    """Photos without cameras of two people who are found in another order in each; their keypoints have one order."""
+    truth = load_capture("demo_capture")
+    without(mine, *TOOLS)
+    shown = detect.found_in_capture("me")
+    beside = np.full((60, 30), 255, np.uint8)
+    for v, photo in enumerate(shown):
+        bystander, person = photo.people
+        people = (bystander._replace(mask=beside), person)
+        name = f"cam{v}.png"
+        shown[v] = dataclasses.replace(photo, name=name, people=people[:: 1 if v % 2 else -1], unclear=True)
+    points = {"person": landmarks_in(truth, COCO_17.names), "bystander": np.random.default_rng(0).uniform(5, 29, (4, 17, 2))}
+    (mine / "keypoints").mkdir()
+    for v in range(4):
+        both = [{"keypoints": points[who][v].tolist(), "keypoint_scores": [0.9] * 17} for who in ("bystander", "person")]
+        write_json(mine / "keypoints" / f"cam{v}.json", both)
+    write_masks(mine / "masks", truth.masks)
+    monkeypatch.setattr(photos_alone.detect, "detect_photos", lambda names, photos: shown)
+    monkeypatch.setattr(photos_alone, "same_people", lambda photos: photos)
+    return mine
+
+
+def write_masks(folder, masks):
+    folder.mkdir()
+    for v, mask in enumerate(masks):
+        write_png(folder / f"cam{v}.png", mask)
+
+
+@pytest.mark.parametrize(("who", "area"), [(0, 2e5), (1, 1e5)])
+def test_without_cameras_keypoints_of_several_people_choose_in_each_photo(who, area, two_people):
+    """`--person` counts in the keypoint file; the person whom the detector found there has the cameras and masks."""
+    files = sorted((two_people / "images").iterdir())
+    choice = photos_alone._Choice(who, two_people / "keypoints", None, Path("me"))
+    looked = photos_alone._look(two_people / "images", files, files, choice)
+    assert looked.shown == [0, 1, 2, 3] and [photo.people[looked.number].area for photo in looked.photos] == [area] * 4
+    with pytest.raises(CaptureError, match="2 people: expected one"):
+        photos_alone._look(two_people / "images", files, files, choice._replace(person=None))
+
+
+def test_without_cameras_masks_choose_in_each_photo(two_people):
+    files = sorted((two_people / "images").iterdir())
+    choice = photos_alone._Choice(None, None, two_people / "masks", Path("me"))
+    looked = photos_alone._look(two_people / "images", files, files, choice)
+    assert [photo.people[looked.number].area for photo in looked.photos] == [1e5] * 4
+
+
+@pytest.mark.slow  # finds the cameras
+def test_start_goes_on_with_the_person_whom_the_keypoints_choose(two_people, detected, monkeypatch, capsys):
+    strangers = detect.detect_photos(None, None)
+
+    def with_strangers(names, photos):
+        found = detect_photos(names, photos)
+        others = [max(photo.people, key=lambda each: each.area) for photo in strangers]
+        return [dataclasses.replace(p, people=(other, *p.people)) for p, other in zip(found, others, strict=True)]
+
+    monkeypatch.setattr(detect, "detect_photos", with_strangers)
+    shutil.rmtree(two_people / "masks")
+    command = ["start", str(two_people), "--out", "me", "--height", "1.7"]
+    assert cli.execute(command) == cli.BAD_DATA
+    assert "2 people: expected one. Person I is the I-th" in capsys.readouterr().err
+    assert cli.execute([*command, "--person", "1"]) == cli.BAD_DATA
+    assert capsys.readouterr().err.endswith("humangs: error: the fit\n")
+    apart = np.abs(load_photos("me").masks - load_capture("demo_capture").masks).mean()
+    assert apart < 0.02 and detected[0].keypoints == two_people / "keypoints"
 
 
 @pytest.mark.slow  # finds the cameras

@@ -17,7 +17,7 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_image
+from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_grey, read_image
 
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
@@ -231,6 +231,14 @@ def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int,
         return flag
     wanted = " or ".join(f"{width} x {height}" for width, height in dict.fromkeys((shown, stored)))
     raise CaptureError(mask, "size", f"{size[0]} x {size[1]}, but its photo has {wanted}: expected the same")
+
+
+def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
+    """Reads the mask of a photo, as the photo is shown. Raises: CaptureError if there is none, or one of another size."""
+    file = _mask_file(masks, images, image)
+    flag, stored = read_checked(orientation, image), photo_size(image)
+    shown = stored if flag < 5 else stored[::-1]
+    return oriented(read_checked(read_grey, file), _mask_flag(file, flag, stored, shown))
 
 
 def turned_cameras(calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]) -> Calibration:
