@@ -125,8 +125,8 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
     return Encoding((CURVES.get(transfer, srgb_to_light),), matrix, bright, camera=transfer == HLG)
 
 
-GAMMA_OF_SRGB, GAMMA_SLACK = 1 / 2.2, 0.02
-"""What PNG files say of sRGB, and what makes no difference."""
+GAMMA_OF_SRGB, GAMMA_SLACK = 1 / 2.2, 0.06
+"""What PNG files say of sRGB; and within it what programs write of videos (1 / 1.96), which are shown as sRGB, too."""
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:

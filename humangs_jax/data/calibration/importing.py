@@ -128,11 +128,13 @@ def import_cameras(
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
     check_place(out, overwrite, (source, images, masks))
-    with photos_of_videos(images, masks, out, every, frames) as (images, masks):
-        calibration = read_calibration(source, lambda name: photo_size(photo_of(images, name, source)))
-        return import_calibration(
-            calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers, also=also
+    with photos_of_videos(images, masks, out, every, frames) as found:
+        calibration = read_calibration(source, lambda name: photo_size(photo_of(found.images, name, source)))
+        report = import_calibration(
+            calibration, found.images, out, masks=found.masks, scale=scale, up=up, pixel_centers=pixel_centers, also=also
         )
+    notes, warnings = (*report.notes, *found.notes), (*report.warnings, *found.warnings)
+    return dataclasses.replace(report, notes=notes, warnings=warnings)
 
 
 def import_calibration(

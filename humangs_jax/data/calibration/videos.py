@@ -2,23 +2,31 @@
 
     CAMERA.mp4 (.mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0, every, 2 every ...
 
-All videos of several cameras have to begin at the same moment and to have the same rate. Masks are videos of the same names.
+All videos of several cameras have to begin at the same moment. Where their rates differ, or one lacks frames, those of one
+moment are found by time (`moments`), and the numbers are those of moments. Masks are videos of the same names.
+
+What a video says about itself is obeyed: pixels that are not square are scaled to square ones, and colors of high dynamic range
+or of wide primaries are converted to those of sRGB. Other videos keep their values.
 
 Of one video, of a phone that goes around a person or of a person who turns, frames are taken that are sharp and differ: each of
 equal windows of time offers its sharpest one, and that is taken which differs most from all that were taken, until none does.
 """
 
 import contextlib
+import re
 import subprocess
 import tempfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.data.calibration.moments import Moments, find_moments, nearest, progressions
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.io.color_spaces import Encoding, cube, of_code_points
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
@@ -40,58 +48,233 @@ def find_videos(folder: Path) -> dict[str, Path]:
     return found
 
 
+class _Shown(NamedTuple):
+    """What is to be done with frames so that they are as a player shows them."""
+
+    shape: str = ""
+    """ffmpeg's filter that makes pixels square."""
+    matrix: str = "auto"
+    encoding: Encoding | None = None
+    """Of colors that are not sRGB's."""
+    about: str = ""
+    """The colors, in words."""
+    rate: float | None = None
+    """Frames a second in the mean."""
+
+
+class VideoPhotos(NamedTuple):
+    """Folders of photos and masks, and what is to be told about how they came from videos."""
+
+    images: Path
+    masks: Path | None
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
 @contextlib.contextmanager
 def photos_of_videos(
     images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
-) -> Generator[tuple[Path, Path | None]]:
+) -> Generator[VideoPhotos]:
     """Folders of photos and masks. Those of videos are written beside `place` and removed in the end; others are as given.
 
-    Arguments: every: frame step, from frame 0. most: photos of a camera, None: all.
+    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all.
     Raises: CaptureError naming the video, also if every or most ask something of folders that hold none.
     """
     videos = {kind: find_videos(folder) for kind, folder in (("images", images), ("masks", masks)) if folder is not None}
     if not any(videos.values()):
         if every != 1 or most is not None:
             raise CaptureError(images, "", f"no video ({', '.join(SUFFIXES)}): frames can be chosen of videos only")
-        yield images, masks
+        yield VideoPhotos(images, masks)
         return
     if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
         raise CaptureError(masks or images, lonely[0], "expected a video of photos and one of masks, or folders of both")
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
-        folders: dict[str, Path | None] = {"images": images, "masks": masks}
-        for kind, found in videos.items():
-            folders[kind], pixels = Path(temporary) / kind, 0
-            for camera, path in found.items():
-                pixels = split_video(path, Path(temporary) / kind / camera, every, most, pixels)
-        assert folders["images"] is not None
-        yield folders["images"], folders["masks"]
+        own, mattes = Path(temporary) / "images", Path(temporary) / "masks"
+        moments, seconds = _moments(videos["images"], every, most)
+        pixels = 0
+        for camera, path in videos["images"].items():
+            chosen = None if moments is None else moments.frames[camera][::every][:most]
+            pixels = split_video(path, own / camera, every, most, pixels, chosen=chosen)
+        pixels = 0
+        for camera, path in videos.get("masks", {}).items():
+            chosen = None if moments is None else _mask_frames(path, camera, moments, seconds)[::every][:most]
+            photos = videos["images"][camera]
+            pixels = split_video(path, mattes / camera, every, most, pixels, chosen=chosen, mask_of=photos)
+        notes = [note for path in videos["images"].values() if (note := _color_note(path))]
+        notes += [] if moments is None else moments.notes
+        warnings = () if moments is None else moments.warnings
+        yield VideoPhotos(own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings)
 
 
-def split_video(path: Path, folder: Path, every: int = 1, most: int | None = None, before: int = 0) -> int:
+def _moments(videos: Mapping[str, Path], every: int, most: int | None) -> tuple[Moments | None, float | None]:
+    """The moments of several videos, or None of one, or of the first frames; and the seconds that were looked at, None: all."""
+    if len(videos) < 2 or most == 1:
+        return None, None
+    rates = []
+    for path in videos.values():
+        with reading(path, "video", CaptureError):
+            rates += filter(None, [_shown(path).rate])
+    seconds = None if most is None or not rates else (most * every + 1) / min(rates)
+    return find_moments({camera: frame_times(path, seconds) for camera, path in videos.items()}), seconds
+
+
+def _mask_frames(path: Path, camera: str, moments: Moments, seconds: float | None) -> list[int | None]:
+    """The numbers of a camera's masks at the moments: those of its photos if there are as many, else by their own times."""
+    times = frame_times(path, seconds)
+    if len(times) == moments.counts[camera] or not np.isfinite(times).all():
+        return moments.frames[camera]
+    numbers = nearest(times - times[0], moments.times)
+    photos = moments.frames[camera]
+    return [number if photo is not None else None for number, photo in zip(numbers, photos, strict=True)]
+
+
+def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
+    """Seconds at which the frames of a video are shown, in order, up to some; NaN where it does not say.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        command = _ffmpeg(path, "metadata=mode=add:key=a:value=a,metadata=mode=print:file=-")
+        command += [] if seconds is None else ["-t", f"{seconds:.6f}"]
+        lines = _finished(path, [*command, "-f", "null", "-"]).decode(errors="replace")
+        found = re.findall(r"^frame:.*pts_time:(\S+)", lines, re.MULTILINE)
+        if not found:
+            raise _said(path, b"")
+        return np.asarray([float(each) if each != "NOPTS" else np.nan for each in found])
+
+
+def split_video(
+    path: Path,
+    folder: Path,
+    every: int = 1,
+    most: int | None = None,
+    before: int = 0,
+    *,
+    chosen: Sequence[int | None] | None = None,
+    mask_of: Path | None = None,
+) -> int:
     """Write frames of a video as 00000000.png, ... into a new folder.
 
-    Arguments: before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
+    Arguments: before: pixels of the frames of other videos, which count towards the limit `video_pixels`. chosen: in place of
+    `every` and `most`, the frame for each file, ascending; there is no file for None. mask_of: the video whose masks these are:
+    its shape is theirs, and their values are no colors.
     Returns: pixels of all frames so far.
     Raises: CaptureError naming the video.
     """
     with reading(path, "video", CaptureError):
-        width, height = _frame_size(path)
+        shown = _shown(path) if mask_of is None else _shown_as_mask(path, mask_of)
+        width, height = _frame_size(path, shown)
         folder.mkdir(parents=True)
-        room = max(0, limits().video_pixels - before) // (width * height)
-        count = _run(path, folder, f"not(mod(n\\,{every}))", room + 1 if most is None else min(most, room + 1))
+        if chosen is None:
+            room = max(0, limits().video_pixels - before) // (width * height)
+            count = _run(path, folder, f"not(mod(n\\,{every}))", room + 1 if most is None else min(most, room + 1), shown)
+        else:
+            count = sum(number is not None for number in chosen)
+            _check_pixels(before + count * width * height, count, width, height)
+            _write_chosen(path, folder, chosen, shown)
         pixels = before + count * width * height
         _check_pixels(pixels, count, width, height)
         return pixels
 
 
-def _frame_size(path: Path) -> tuple[int, int]:
+def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown: _Shown) -> None:
+    places = [place for place, number in enumerate(chosen) if number is not None]
+    numbers = [number for number in chosen if number is not None]
+    if not numbers:
+        raise Refused("has no frame at the moments of the others")
+    if _run(path, folder, _expression(numbers), len(numbers), shown) != len(numbers):
+        raise Refused(f"has fewer frames than expected: {numbers[-1] + 1:,}, as many as the video that it goes with")
+    for i, place in reversed(list(enumerate(places))):  # from the end: a name is free when it is taken
+        (folder / f"{i:08d}.png").rename(folder / f"{place:08d}.png")
+
+
+MOST_RUNS = 2000
+"""Terms of an expression of ffmpeg, which is an argument of a program."""
+
+
+def _expression(numbers: Sequence[int]) -> str:
+    """ffmpeg's condition for frames of these numbers. Raises: Refused for too many that follow no rule."""
+    terms = [
+        f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))" if step else f"eq(n\\,{first})"
+        for first, step, last in progressions(numbers)
+    ]
+    if len(terms) > MOST_RUNS:
+        count = f"{len(numbers):,} frames to be paired by time with those of other rates"
+        raise Refused(f"{count}: expected fewer (--every, --max-frames)")
+    return "+".join(terms)
+
+
+def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
     open_file(path).close()  # no devices, no pipes, not too large
-    first = _finished(path, [*_ffmpeg(path, "null"), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"])
+    filters = shown.shape or "null"
+    first = _finished(path, [*_ffmpeg(path, filters), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"])
     if not first:
         raise _said(path, b"")
     with image_in(first) as image:
         return image.size
+
+
+# What a video says about itself ---------------------------------------------------------------------------------------
+
+STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
+COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
+"""Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67, progressive)."""
+PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
+RATE = re.compile(r", ([\d.]+)(k?) fps\b")
+PRIMARIES = {"bt2020": 9, "smpte432": 12}
+TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
+"""ffmpeg's names of what H.273 numbers; videos of all others are shown as sRGB."""
+WIDEST_PIXEL = 4
+"""Sides of a pixel that is not square, over each other; the widest in use is 2."""
+SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
+"""Only makes frames larger: nothing is lost."""
+TABLE = "colors.cube"
+
+
+def _shown(path: Path) -> _Shown:
+    """What ffmpeg prints of a video. Raises: OSError; Refused for pixels that nobody shows."""
+    open_file(path).close()
+    # without an output ffmpeg fails, after it has printed what is there
+    printed = subprocess.run(_opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False).stderr
+    line = STREAM.search(printed.decode(errors="replace"))
+    if line is None:
+        return _Shown()  # what reads its frames says what is wrong
+    rate, shape, colors = RATE.search(line[1]), PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
+    found = _Shown(rate=float(rate[1]) * (1000 if rate[2] else 1) if rate else None)
+    if shape is not None and shape[1] != shape[2]:
+        wide, high = int(shape[1]), int(shape[2])
+        if max(wide, high) > WIDEST_PIXEL * min(wide, high):
+            problem = f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to 1, or square ones"
+            raise Refused(problem)
+        found = found._replace(shape=SQUARE)
+    return found if colors is None else _with_colors(found, *colors.groups())
+
+
+def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _Shown:
+    bright = transfer in TRANSFERS
+    code = PRIMARIES.get(primaries, PRIMARIES["bt2020"] if bright and primaries == "unknown" else 1)
+    encoding = of_code_points(code, TRANSFERS.get(transfer, 1))
+    if encoding is None:
+        return shown
+    wide = matrix.startswith("bt2020") or (bright and matrix == "unknown")
+    return shown._replace(matrix="bt2020" if wide else "auto", encoding=encoding, about=f"{primaries}, {transfer}")
+
+
+def _shown_as_mask(path: Path, photos: Path) -> _Shown:
+    """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and say nothing; no colors."""
+    own, theirs = _shown(path), _shown(photos)
+    as_stored = _Shown()
+    if not own.shape and theirs.shape and _frame_size(path, as_stored) == _frame_size(photos, as_stored):
+        width, height = _frame_size(photos, theirs)
+        return _Shown(shape=f"scale=w={width}:h={height},setsar=1")
+    return own._replace(encoding=None)
+
+
+def _color_note(path: Path) -> str | None:
+    with reading(path, "video", CaptureError):
+        shown = _shown(path)
+    return None if shown.encoding is None else f"videos with other colors than sRGB's ({shown.about}): converted"
 
 
 def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
@@ -106,7 +289,7 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
     """
     with reading(path, "video", CaptureError):
         folder.mkdir(parents=True)
-        if _run(path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen)) != len(chosen):
+        if _run(path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen), _shown(path)) != len(chosen):
             raise Refused("its frames are not the same when they are read again")
         for i, frame in enumerate(chosen):
             (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
@@ -115,7 +298,7 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
 def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
     """All frames of a video, one after the other, grey and no larger than that. Raises: CaptureError naming the video."""
     with reading(path, "video", CaptureError):
-        width, height = _frame_size(path)
+        width, height = _frame_size(path, _shown(path))
         room, scale = limits().video_pixels // (width * height), min(1.0, longer_side / max(width, height))
         w, h = (max(1, round(side * scale)) for side in (width, height))
         command = [*_ffmpeg(path, f"scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
@@ -137,20 +320,32 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
                 process.kill()
 
 
-def _ffmpeg(path: Path, filters: str) -> list[str]:
+def _opened(path: Path, verbosity: str = "error") -> list[str]:
+    """The beginning of a command of ffmpeg: the program, and the video."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-v", verbosity, "-nostdin", "-xerror"]
     # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
     command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
-    command += ["-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
-    return [*command, "-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
+    return [*command, "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
 
 
-def _run(path: Path, folder: Path, select: str, most: int) -> int:
+def _ffmpeg(path: Path, filters: str) -> list[str]:
+    return [*_opened(path), "-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
+
+
+def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
     """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there are."""
-    command = [*_ffmpeg(path, f"select={select}"), "-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
+    table, filters = folder / TABLE, [f"select={select}", *filter(None, [shown.shape])]
+    if shown.encoding is not None:
+        table.write_text(cube(shown.encoding))
+        whole = f"scale=in_color_matrix={shown.matrix}:flags=accurate_rnd+full_chroma_int,format=rgb48"
+        filters += [whole, f"lut3d=file={TABLE}:interp=tetrahedral", "format=rgb24"]
+    # a PNG would say for each program in its own words that its values are a video's
+    filters += ["setparams=color_primaries=unknown:color_trc=unknown"]
+    command = [*_ffmpeg(path, ",".join(filters)), "-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
     _finished(path, command, folder)  # in the folder: its path may hold a % of its own
+    table.unlink(missing_ok=True)
     if not (count := sum(1 for _ in folder.iterdir())):
         raise _said(path, b"")
     return count

@@ -1,0 +1,136 @@
+"""Which frames of several videos show one moment: by time, because rates differ and phones drop frames.
+
+All videos begin at the same moment. The slowest one says which moments there are; each other camera gives the frame that is
+nearest in time, or none, where it has a gap.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture_checks import counted
+
+NEAR = 0.6
+"""Steps of a camera by which its frame may be off: half of one, and what clocks of phones shake."""
+GAP = 1.5
+"""Steps between two frames, beyond which frames are missing between them."""
+SAME_RATE = 0.01
+"""Share by which the steps of cameras of one rate differ."""
+USUAL_STEP = 1 / 30
+"""Seconds between two frames, where no video tells."""
+
+
+class Moments(NamedTuple):
+    """Which frame of each camera shows each moment."""
+
+    times: Float[np.ndarray, " m"]
+    """Seconds after the first frames."""
+    frames: dict[str, list[int | None]]
+    """Numbers of frames, from 0, one for each moment; None where a camera has none."""
+    counts: dict[str, int]
+    """Frames of each camera."""
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
+    """The moments of some cameras, of the seconds at which each has its frames (NaN where that is not known)."""
+    steps = {camera: _step(each) for camera, each in times.items()}
+    known = [step for step in steps.values() if step is not None]
+    slowest = max(known, default=USUAL_STEP)
+    clocks = {camera: _clock(each, steps[camera], slowest) for camera, each in times.items()}
+    moments = _all_moments(clocks, {camera: step or slowest for camera, step in steps.items()})
+    frames = {camera: nearest(each, moments) for camera, each in clocks.items()}
+    counts = {camera: len(each) for camera, each in times.items()}
+    return Moments(moments, frames, counts, _notes(clocks, frames, known), _warnings(clocks, frames, moments))
+
+
+def _step(times: Float[np.ndarray, " n"]) -> float | None:
+    """Seconds between two frames, None where times do not tell."""
+    apart = np.diff(times)
+    if not len(apart) or not np.isfinite(apart).all() or not (apart > 0).all():
+        return None
+    return float(np.mean(apart[apart < GAP * np.median(apart)]))
+
+
+def _clock(times: Float[np.ndarray, " n"], step: float | None, slowest: float) -> Float[np.ndarray, " n"]:
+    """Seconds after the first frame; where a video does not tell them it is taken to be as fast as the slowest one."""
+    return np.arange(len(times)) * slowest if step is None else times - times[0]
+
+
+def _all_moments(clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]) -> Float[np.ndarray, " m"]:
+    """The times of the slowest camera, with those that it lacks in its gaps and behind its end."""
+    slowest = max(steps.values())
+    slow = [camera for camera, step in steps.items() if step > (1 - SAME_RATE) * slowest]
+    own = max((clocks[camera] for camera in slow), key=lambda each: len(each))
+    parts = [own[:1]]
+    for before, after in itertools.pairwise(own.tolist()):
+        missing = round((after - before) / slowest) if after - before > GAP * slowest else 1
+        parts.append(before + (after - before) * np.arange(1, missing + 1) / missing)
+    end = max(each[-1] for each in clocks.values())
+    further = max(0, int(np.floor((end - own[-1]) / slowest + NEAR - 0.1)))
+    return np.concatenate([*parts, own[-1] + slowest * np.arange(1, further + 1)])
+
+
+def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
+    """The frame of a camera at each moment, None where the nearest one is too far, or nearer to another moment."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else USUAL_STEP
+    found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
+    off = np.abs(times[found] - moments)
+    best: dict[int, int] = {}
+    for place, number in enumerate(found.tolist()):
+        other = best.get(number)
+        if off[place] <= NEAR * step and (other is None or off[place] < off[other]):
+            best[number] = place
+    numbers: list[int | None] = [None] * len(moments)
+    for number, place in best.items():
+        numbers[place] = number
+    return numbers
+
+
+def _notes(
+    clocks: Mapping[str, Float[np.ndarray, " n"]], frames: Mapping[str, Sequence[int | None]], steps: Sequence[float]
+) -> tuple[str, ...]:
+    if not steps or max(steps) < (1 + SAME_RATE) * min(steps):
+        return ()
+    apart = 0.0
+    for numbers in zip(*frames.values(), strict=True):
+        seen = [clock[number] for clock, number in zip(clocks.values(), numbers, strict=True) if number is not None]
+        apart = max(apart, float(np.ptp(seen))) if seen else apart
+    rates = " and ".join(dict.fromkeys(f"{1 / step:.3g}" for step in sorted(steps)))
+    return (f"videos of {rates} frames a second: paired by time, views of one moment are at most {apart:.3f} s apart",)
+
+
+def _warnings(
+    clocks: Mapping[str, Float[np.ndarray, " n"]],
+    frames: Mapping[str, Sequence[int | None]],
+    moments: Float[np.ndarray, " m"],
+) -> tuple[str, ...]:
+    """A line for each camera that has no frame at a moment before its end, or that ends before others."""
+    found = []
+    for camera, numbers in frames.items():
+        without = moments[[number is None for number in numbers]]
+        inside = without[without < clocks[camera][-1]]
+        if len(inside):
+            where = f"{inside[0]:.2f} to {inside[-1]:.2f} s"
+            found.append(
+                f"{camera}: no frame at {counted(len(inside), 'moment')} ({where}): left out there; were frames dropped?"
+            )
+        if len(behind := without[without >= clocks[camera][-1]]) > 1:
+            found.append(f"{camera}: ends at {clocks[camera][-1]:.2f} s, {counted(len(behind), 'moment')} before the last video")
+    return tuple(found)
+
+
+def progressions(numbers: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Arithmetic progressions (first, step, last) that ascending numbers are made of; the step of a single number is 0."""
+    found: list[tuple[int, int, int]] = []
+    for number in numbers:
+        first, step, last = found[-1] if found else (number, -1, number)
+        if step == 0 or (step > 0 and number == last + step):
+            found[-1] = (first, number - last, number)
+        else:
+            found.append((number, 0, number))
+    return found
