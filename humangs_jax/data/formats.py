@@ -213,8 +213,10 @@ class ArrayKeys:
     scaling: str | None = None
     """The key of what translations are divided by, 1000 without it."""
     pivot: str = "pelvis"
-    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which positions are applied last), or
-    the "head"."""
+    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which positions are applied last),
+    the "head", or the root "joint" in space."""
+    six: bool = False
+    """Rotations are six numbers each, with the frames as last axis."""
     stays: bool = False
     kind: str = "poses"
     """What reads it: "ours" are whole rotations, "points" joints in space."""
@@ -251,6 +253,23 @@ MOTIONS = Formats(
     wham=_arrays("WHAM", "pose_world trans_world", "all=pose_world", use=_ALONE | {"moves": ("trans_world",)}),
     tram=_arrays("TRAM", "pred_rotmat pred_trans", "all=pred_rotmat", use=_ALONE | {"moves": ("pred_trans",)}),
     human3r=_arrays("Human3R", "rotvec transl", "all=rotvec", use=_ALONE | {"up": "-y", "also": ("y",), "pivot": "head"}),
+    mdm=_arrays(
+        *("MDM (_smpl_params.npy)", "thetas root_translation", "all=thetas"),
+        use=_ALONE | {"moves": ("root_translation",), "fps": 20.0, "also": (), "pivot": "joint", "six": True},
+    ),
+    kimodo=_arrays(
+        *("Kimodo", "local_rot_mats root_positions", "all=local_rot_mats"),
+        use=_ALONE | {"moves": ("root_positions",), "also": (), "pivot": "joint"},
+    ),
+    motionx=_arrays(
+        *("Motion-X, a single array", "(m,322)"),
+        "root=root_orient limbs=pose_body jaw=pose_jaw hands=pose_hand",
+        use=_ALONE | {"moves": ("trans",), "also": ("z", "-y")},
+    ),
+    rows=_arrays(
+        *("poses in a single array", "(m,165/156/72/66)", "all=(m,165/156/72/66)"),
+        use=_ALONE | {"also": ("z", "-y"), "stays": True},
+    ),
     sam3d=_arrays(
         "SAM 3D Body", "pred_joint_coords", "all=pred_joint_coords", use=_ALONE | {"moves": ("pred_cam_t",), "kind": "points"}
     ),

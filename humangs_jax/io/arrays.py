@@ -249,6 +249,12 @@ def read_npz(path: str | Path, wanted: Callable[[str], bool] | None = None) -> t
     return arrays, tuple(pickled)
 
 
+def read_npy(path: str | Path) -> np.ndarray | None:
+    """The array of an npy file; None for a pickled object. Raises: FileNotFoundError; FileError."""
+    with reading(path, "npy file"), open_file(path, "array_bytes") as file:
+        return _read_array(file, os.path.getsize(path))
+
+
 def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     """A zip archive whose members together stay within the limits.
 

@@ -118,6 +118,39 @@ def parts(rotations=ROTATIONS, places=PLACES, shape=lambda x: x.reshape(len(x), 
     return {key: shape(value) for key, value in found.items()} | {"transl": places}
 
 
+def array(name, values):
+    def write(folder):
+        np.save(folder / name, values)
+        return folder / name
+
+    return write
+
+
+def mdm(frames=FRAMES):
+    """24 joints of SMPL by the first two rows of their matrices and the pelvis in space, the frames last."""
+    turns = matrices(np.concatenate([ROTATIONS[:frames, :22], np.zeros((frames, 2, 3))], axis=1))
+    thetas = turns[..., :2, :].reshape(frames, 24, 6).transpose(1, 2, 0).astype(np.float32)
+    moves = (PLACES[:frames] + PELVIS).T
+    motion = np.concatenate([thetas, np.pad(moves, ((0, 3), (0, 0)))[None]])
+    named = {"thetas": thetas, "root_translation": moves, "motion": motion, "faces": np.zeros((4, 3), int)}
+    return named | {"vertices": np.zeros((9, 3, frames)), "text": "a person walks", "length": frames}
+
+
+def motion_x(rotations=ROTATIONS, places=PLACES):
+    flat, rows = rotations.reshape(FRAMES, 165), np.full((FRAMES, 322), 0.3)
+    rows[:, :66], rows[:, 66:156], rows[:, 156:159] = flat[:, :66], flat[:, 75:], flat[:, 66:69]
+    rows[:, 309:312] = places
+    return rows
+
+
+def kimodo(joints=22):
+    """Local and global matrices, and where the pelvis is."""
+    local = np.tile(np.eye(3), (FRAMES, joints, 1, 1))
+    local[:, :22] = matrices(ROTATIONS[:, :22])
+    named = {"local_rot_mats": local, "global_rot_mats": local, "root_positions": PLACES + PELVIS}
+    return named | {"posed_joints": np.zeros((FRAMES, joints, 3)), "foot_contacts": np.zeros((FRAMES, 4), bool)}
+
+
 def smpl(rotations=ROTATIONS, places=PLACES):
     """SMPL's 24 joints, rotation matrices as 4D-Humans has them."""
     hands = np.zeros((len(rotations), 2, 3))
@@ -309,6 +342,14 @@ FILES = {
         ),
         *(EVERY, {}),
     ),
+    "MDM": (objects("sample00_rep00_smpl_params.npy", mdm()), BODY, {}),
+    "MDM, three frames": (objects("a.npy", mdm(3)), BODY, {"frames": 3}),
+    "Motion-X": (array("000001.npy", motion_x()), [*WITH_FACE[:23], *range(25, 55)], {}),
+    "Motion-X, z up": (array("000001.npy", motion_x(*down(ROTATIONS, PLACES, "z"))), [*WITH_FACE[:23], *range(25, 55)], {}),
+    "rows of SMPL": (array("poses.npy", np.pad(FLAT[:, :66], ((0, 0), (0, 6)))), BODY, {"places": False}),
+    "rows of SMPL-X": (array("poses.npy", FLAT.astype(np.float32)), EVERY, {"places": False}),
+    "rows of matrices": (array("poses.npy", np.asfortranarray(matrices(ROTATIONS[:, :22]))), BODY, {"places": False}),
+    "Kimodo": (npz(**kimodo()), BODY, {}),
     "SLAHMR": (slahmr([(OTHER, AWAY), (ROTATIONS[:4], PLACES[:4])]), BODY, {"person": 1, "frames": 4}),
 }
 """What writes a file, the joints that it has, and options; places: whether positions are in it; frames: of it."""
@@ -324,7 +365,41 @@ def test_what_was_written_is_read(kind, tmp_path):
     np.testing.assert_allclose(matrices(motion.rotations), matrices(expected), atol=MATRICES)
     if placed:
         np.testing.assert_allclose(motion.translations, PLACES[:frames], atol=MATRICES)
-    assert motion.fps == {"smplcodec": 24.0, "AIST++": 60.0}.get(kind, 30.0)
+    assert motion.fps == {"smplcodec": 24.0, "AIST++": 60.0, "MDM": 20.0, "MDM, three frames": 20.0}.get(kind, 30.0)
+
+
+def with_values(values, **changes):
+    return npz(**{**values, **changes})
+
+
+NO_MOTIONS = {
+    "features of HumanML3D": (array("a.npy", np.zeros((9, 263))), "263 features a frame of HumanML3D, not rotations"),
+    "features of KIT": (array("a.npy", np.zeros((9, 251))), "251 features a frame of KIT-ML"),
+    "joints of HumanML3D": (array("a.npy", np.zeros((9, 22, 3))), r"22 joints in space \(HumanML3D's new_joints\), or"),
+    "points": (array("a.npy", np.zeros((9, 24, 3))), "24 joints in space, or axis-angles in three axes: expected a row"),
+    "another array": (array("a.npy", np.zeros((9, 100))), r"an array of shape \(9, 100\): expected .* 322, 165, 156, 72, 66"),
+    "a number": (array("a.npy", np.asarray(3.0)), r"an array of shape \(\)"),
+    "text": (array("a.npy", np.asarray(["a"] * 72)[None]), "expected real numbers"),
+    "matrices that are none": (array("a.npy", np.ones((9, 22, 3, 3))), "expected rotation matrices"),
+    "results of MDM": (
+        objects("results.npy", {"motion": np.zeros((2, 22, 3, 9)), "text": ["a", "b"], "lengths": np.asarray([9, 9])}),
+        "these are joints in space that MDM sampled: .*visualize.render_mesh",
+    ),
+    "MDM without its last axis": (objects("a.npy", mdm() | {"thetas": np.zeros((24, 6))}), r"thetas: expected shape \(24, 6, fr"),
+    "MDM of zeros": (objects("a.npy", mdm() | {"thetas": np.zeros((24, 6, 6))}), "thetas"),
+    "MDM of fewer places": (objects("a.npy", mdm() | {"root_translation": np.zeros((3, 5))}), r"root_translation: expected"),
+    "Kimodo's SOMA": (npz(**kimodo(77)), "local_rot_mats: .* 77 joints of SOMA: write a .bvh of them"),
+    "Kimodo without places": (with_values(kimodo(), root_positions=np.zeros((5, 3))), r"root_positions: expected shape \(6, 3\)"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_MOTIONS)
+def test_arrays_that_are_no_motion_say_what_they_are(kind, tmp_path):
+    write, message = NO_MOTIONS[kind]
+    path = write(tmp_path)
+    with pytest.raises(MotionError, match=message) as error:
+        load_motion(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
 def mhr(rots=True, frames=FRAMES):

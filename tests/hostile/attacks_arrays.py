@@ -1,5 +1,6 @@
 """Arrays of avatars, bodies, motions, fits and banks: not finite, out of range, of other types and shapes."""
 
+import io
 import json
 import tempfile
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import dataset_files
 import honest_files as honest
 import numpy as np
-from hostile_cases import capture_with, case
+from hostile_cases import capture_with, case, written
 from readers import AMASS
 
 from humangs_jax.body.library import save_body
@@ -179,6 +180,49 @@ for value in (1e38, 1e300, 1e9):
         arrays_case(f"{key} of {value:g}", "motion npz", honest.motion_arrays, put(key, value))
     for key in ("poses", "trans"):
         arrays_case(f"{key} of {value:g}", "amass", AMASS.copy, put(key, value))
+
+
+def written_array(name, value):
+    stream = io.BytesIO()
+    np.save(stream, value, allow_pickle=True)
+    return written(name, stream.getvalue())
+
+
+ROWS = {
+    "no axes": np.asarray(1.0),
+    "no rows of 322": np.zeros((0, 322)),
+    "no columns": np.zeros((9, 0)),
+    "seven axes": np.zeros((1,) * 7),
+    "matrices of NaN": np.full((3, 22, 3, 3), np.nan),
+    "infinite rows": np.full((3, 322), np.inf),
+    "rows of words": np.full((3, 72), "x"),
+    "complex rows": np.ones((3, 72), complex),
+    "rows of 10^300": np.full((3, 322), 1e300),
+    "joints of no frames": np.zeros((0, 22, 3)),
+    "300,000 rows": np.zeros((300_000, 72), np.float32),
+}
+for kind, rows in ROWS.items():
+    case(kind, "motion x", written_array("m.npy", rows), item=5 if "," in kind else 6)
+SIX = {
+    "one axis": {"thetas": np.zeros(6)},
+    "no joints": {"thetas": np.zeros((0, 6, 3))},
+    "no frames": {"thetas": np.zeros((24, 6, 0))},
+    "words for rotations": {"thetas": np.full((24, 6, 3), "x")},
+    "first rows that are parallel": {"thetas": np.ones((24, 6, 3))},
+    "places of another shape": {"root_translation": np.zeros((2, 2, 2))},
+    "a word for a place": {"root_translation": "x"},
+    "a dict for rotations": {"thetas": {}},
+}
+for kind, change in SIX.items():
+    case(kind, "mdm", written_array("m.npy", honest.MDM | change), item=6)
+TURNS = {
+    "zeros for matrices": {"local_rot_mats": np.zeros((3, 22, 3, 3))},
+    "23 joints": {"local_rot_mats": np.tile(np.eye(3), (3, 23, 1, 1))},
+    "matrices of four rows": {"local_rot_mats": np.zeros((3, 22, 4, 4))},
+    "one place": {"root_positions": np.zeros(3)},
+}
+for kind, change in TURNS.items():
+    arrays_case(kind, "kimodo", lambda change=change: honest.KIMODO | change, lambda arrays: None, 6)
 
 
 def body_of(key, value):

@@ -170,6 +170,10 @@ def motion_arrays(**changes):
     return {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0} | changes
 
 
+MDM = {"thetas": np.tile(np.eye(3)[:2].reshape(1, 6, 1), (24, 1, 3)), "root_translation": np.zeros((3, 3)), "text": "walk"}
+KIMODO = {"local_rot_mats": np.tile(np.eye(3), (3, 22, 1, 1)), "root_positions": np.zeros((3, 3))}
+
+
 def person(count, numbers=3):
     return np.random.default_rng(2).uniform(10, 400, (count, numbers))
 

@@ -17,6 +17,7 @@ from humangs_jax.data.motion import MotionError, Poses, Reading, skeleton
 from humangs_jax.data.motion.people import SHOWN, Person, are_rotations, format_of, read_people
 from humangs_jax.data.motion.rules import COLUMNS, HAND_NUMBERS, MILLIMETRES, NO_PLACES, NO_RATE, PELVIS, joint_places
 from humangs_jax.data.motion.skeleton import Clip
+from humangs_jax.data.motion.vectors import frames_first
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.restricted_pickle import as_array
@@ -25,14 +26,19 @@ from humangs_jax.io.tensors import read_values
 HEAD = JOINT_NAMES.index("head")
 Rotations = Float[np.ndarray, "m n 3"]
 """Axis-angles of the frames."""
+SOMA_JOINTS = 77
+"""Of Kimodo's skeleton that is not SMPL-X's."""
 NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     """The poses of one person. Raises: MotionError, naming the key."""
     person = _chosen(path, read_people(path), options.person)
-    file, form = _MotionFile(path, person, options.fps), format_of(person.values)
+    form = format_of(person.values)
     assert form is not None
+    if form.six:
+        person = person._replace(values=frames_first(person.values, form.poses["all"], form.moves[0]))
+    file = _MotionFile(path, person, options.fps)
     if form.kind == "points":
         return clip_of_points(file, file.rate(form))
     rotations = file.numbers(form.poses["all"], (None, None, 3)) if form.kind == "ours" else _posed(file, form)
@@ -119,6 +125,8 @@ def _all(file: "_MotionFile", form: ArrayKeys, key: str, values: np.ndarray, fla
         return np.concatenate([pose[:, :22], face, pose[:, -30:]], axis=1)
     words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
     joints = f", {width // 3} joints" if width % 3 == 0 else ""
+    if values.shape[1:] == (SOMA_JOINTS, 3, 3):
+        joints = f", {SOMA_JOINTS} joints of SOMA: write a .bvh of them"
     raise MotionError(file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}")
 
 
@@ -154,6 +162,8 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
         moves = moves / scale
     if form.pivot == "origin":
         return moves + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(PELVIS) - PELVIS
+    if form.pivot == "joint":
+        moves = moves - PELVIS
     if form.pivot == "head":
         joints = skeleton.shipped_joints()
         moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, HEAD]

@@ -14,7 +14,8 @@ import numpy as np
 from humangs_jax.data.formats import MOTIONS, ArrayKeys
 from humangs_jax.data.motion import MotionError
 from humangs_jax.data.motion.rules import ORTHONORMAL
-from humangs_jax.io.arrays import ArrayFile
+from humangs_jax.data.motion.vectors import hint_for, values_of
+from humangs_jax.io.arrays import ArrayFile, read_npy
 from humangs_jax.io.reading import Refused, check_limit, open_file, read_json
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
@@ -76,7 +77,11 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
     if file.suffix.lower() == ".json":
         return read_json(file), ()
     with open_file(file) as opened:
-        archive = opened.read(2) == b"PK"
+        start = opened.read(6)
+    array = read_npy(file) if start == np.lib.format.MAGIC_PREFIX else None
+    if array is not None:
+        return values_of(array), ()
+    archive = start.startswith(b"PK")
     if (archive or file.suffix.lower() == ".npz") and file.suffix.lower() not in (".pt", ".pth"):
         found = ArrayFile.open(file, MotionError)
         return found.values, found.pickled
@@ -249,6 +254,7 @@ MORE = ("cam2world", "pred_global_rots")
 
 def expected(values: Mapping[Any, Any]) -> str:
     """What is said of a file of no format."""
-    first = ", ".join(dict.fromkeys(row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None))
+    first_keys = dict.fromkeys(row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None)
+    first = ", ".join(key for key in first_keys if not key.startswith("("))  # that of a single array
     keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"
-    return f"no motion: expected one of the keys {first}, got {keys}"
+    return f"no motion: expected one of the keys {first}, got {keys}{hint_for(values)}"
