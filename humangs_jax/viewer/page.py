@@ -232,7 +232,7 @@ def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar
     Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown
     in the page.
 
-    Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `packing.pack`).
+    Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `pack`).
     """
     name = motion_name or ("walk" if motion is None else "motion")
     if motion is None:

@@ -46,6 +46,17 @@ def test_every_part_is_in_its_place_and_none_ends_a_script_early(text):
     assert header["count"] == 24 and "motion" not in header  # the walk has 55 joints, this avatar 3
 
 
+def test_the_files_that_comments_of_the_page_name_exist():
+    package = Path(page.__file__).parents[1]
+    ours, beside = r"humangs_jax/[\w/]+\.py", r"(?<![\w/.])\w+\.(?:js|html|css|frag|vert)\b"
+    for part in (package / "viewer" / "page").iterdir():
+        text = part.read_text()
+        for name in re.findall(ours, text):
+            assert (package.parent / name).is_file(), f"{part.name}: {name}"
+        for name in re.findall(beside, " ".join(re.findall(r"// .*", text))):
+            assert (part.parent / name).is_file(), f"{part.name}: {name}"
+
+
 def test_a_joint_may_have_any_name():
     text = page.page_html(replace(small_avatar(), joint_names=("</script><b>", "b", "c")))
     assert "</script><b>" not in text

@@ -162,7 +162,7 @@ function rotationMatrix(m, key) {
   return m;
 }
 
-// ---- Which way is up: as humangs_jax/data/motion/world.py --------------------------------------------------------------
+// ---- Which way is up: as humangs_jax/data/motion/rules.py --------------------------------------------------------------
 
 // The world turned so that y is up.
 function turnedUp(motion, format, scene) {

@@ -11,7 +11,7 @@ uniform usampler2D order;      // nearest first
 uniform int count;
 uniform usampler2D gaussians;  // three texels each, see scene.js
 uniform sampler2D means;       // canonical, metres; the normal in 24 bits
-uniform sampler2D harmonics;   // canonical: humangs_jax/rendering/harmonics.py; blocks of `rows`, one for each function
+uniform sampler2D harmonics;   // canonical: humangs_jax/rendering/gaussians.py; blocks of `rows`, one for each function
 uniform int functions;         // 0: none
 uniform int rows;
 layout(std140) uniform Joints {
@@ -23,7 +23,7 @@ uniform vec4 K;                // fx, fy, cx, cy, pixels
 uniform vec2 size;             // pixels
 uniform vec2 log_scale;        // lowest, highest
 uniform vec2 color_range;
-uniform vec3 first_light;      // humangs_jax/avatar/light.py: coefficients of x, y, z; all 0: colours stay
+uniform vec3 first_light;      // humangs_jax/avatar/avatar.py: coefficients of x, y, z; all 0: colours stay
 uniform vec3 more_light;       // of xy, yz, zx
 uniform vec2 last_light;       // of zz - xx, 3 yy - 1
 uniform vec2 shading_range;

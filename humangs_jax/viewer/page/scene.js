@@ -1,8 +1,7 @@
-// The avatar as Python packed it (humangs_jax/viewer/packing.py): arrays, and the textures that the shaders read.
+// The avatar as Python packed it (humangs_jax/viewer/page.py): arrays, and the textures that the shaders read.
 
 const TEXELS_PER_ROW = 3072;  // of the texture of Gaussians: 3 texels each
 const ROW = 1024;             // Gaussians per row of both textures
-const MAX_WEIGHTS = 8;
 
 async function readScene() {
   const header = JSON.parse(document.getElementById("header").textContent);
