@@ -219,7 +219,10 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
 # The page --------------------------------------------------------------------------------------------------------------
 
 
-SCRIPTS = ("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "controls", "main")
+SCRIPTS = (
+    *("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "glb"),
+    *("controls", "main"),
+)
 SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
 LARGEST_FPS = 60.0
 """Motions of more frames per second are thinned out: the page interpolates between frames."""

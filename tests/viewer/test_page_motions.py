@@ -9,6 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 from bvh_files import CMU, INDEX, LAFAN, MIXAMO, frames_along_bones, rest_frames, write_bvh
+from glb_files import write_glb
 from motion_cases import FPS, UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
@@ -16,21 +17,25 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.formats import MOTIONS
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.viewer.page import page_script
 
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="needs node (nodejs.org)")
 EXACT = 1e-5
 """Entries of rotation matrices and metres: float32, and BVH's eight decimals."""
+HOW_TO_CHANGE = ", which fps= changes"
+"""Said in Python alone: the page has a field for it."""
 PROGRAM = """
 const given = JSON.parse(require("fs").readFileSync(0, "utf8")), { scene } = given;
 scene.order = jointOrder(scene.parents);
 (async () => {
   const found = [];
-  for (const [name, content] of given.files) {
+  for (const [name, content, rate] of given.files) {
     const bytes = Buffer.from(content, "base64");
     const file = { name, size: bytes.length, arrayBuffer: async () => new Uint8Array(bytes).buffer };
-    found.push(await readMotionFile(file, scene).catch((error) => ({ error: error.message })));
+    found.push(await readMotionFile(file, scene, rate ?? null)
+      .catch(({ message, asksRate }) => ({ error: message, asksRate })));
   }
   process.stdout.write(JSON.stringify(found));
 })();
@@ -38,13 +43,16 @@ scene.order = jointOrder(scene.parents);
 
 
 def page_reads(files, names=JOINT_NAMES, parents=PARENTS, rest=None):
-    """What the page makes of files, [(name, bytes)]: motions as JSON, or {"error": ...}."""
+    """What the page makes of files, [(name, bytes, frames per second that are asked for or nothing)].
+
+    Motions as JSON, or {"error": ..., "asksRate": ...}.
+    """
     import base64
 
     rest = shipped_joints() if rest is None else rest
     scene = {"rest": np.asarray(rest).tolist(), "parents": list(parents), "names": list(names)}
-    given = {"scene": scene, "files": [(name, base64.b64encode(content).decode()) for name, content in files]}
-    program = page_script("kinematics", "scene", "motion_files", "skeletons") + PROGRAM
+    given = {"scene": scene, "files": [(name, base64.b64encode(content).decode(), *rate) for name, content, *rate in files]}
+    program = page_script("kinematics", "scene", "motion_files", "skeletons", "glb") + PROGRAM
     done = subprocess.run(
         [str(NODE), "--input-type=commonjs", "-e", program],
         **{"input": json.dumps(given), "capture_output": True, "text": True, "check": False},
@@ -167,6 +175,76 @@ def array_files():
     return files
 
 
+def glb_files(folder):
+    """Skeletons as programs write them: below a turned node in centimetres, keys of all kinds, names of VRM, no skin."""
+    rest, moves = other_person(), np.random.default_rng(2).normal(size=(5, 3))
+    quarter = Rotation.from_euler("x", 90, degrees=True)
+    matrix = np.eye(4)
+    matrix[:3, :3] = 0.01 * quarter.inv().as_matrix()
+    above = {"name": "Armature", "matrix": matrix.T.reshape(-1).tolist()}
+    turned = [quarter.apply(pose) for pose in dance(5)]
+    bones = {f"{side} {i}": {"node": i} for i, side in enumerate(CMU)}
+    human = [{"bone": theirs, "node": node["node"]} for theirs, node in zip(CMU.values(), bones.values(), strict=True)]
+    scrambled = {ours: f"thing {i}" for i, ours in enumerate(CMU)}
+    made = {
+        "linear": (rest, dance(5), moves, MIXAMO, {"fps": 30.0}),
+        "splines": (rest, dance(5), moves, CMU, {"interpolation": "CUBICSPLINE"}),
+        "steps": (rest, dance(5), moves, MIXAMO, {"interpolation": "STEP", "fps": 12.5}),
+        "one frame": (rest, dance(1), moves[:1], MIXAMO, {}),
+        "centimetres": (100 * quarter.apply(rest), np.stack(turned), 100 * quarter.apply(moves), MIXAMO, {"above": above}),
+        "names of VRM": (rest, dance(5, CMU), moves, scrambled, {"extensions": {"VRM": {"humanoid": {"humanBones": human}}}}),
+        "two clips": (rest, dance(5), moves, MIXAMO, {"more": [dance(5, seed=1)], "titles": ("walk", "run")}),
+    }
+    for case, (*skeleton, options) in made.items():
+        write_glb(folder / "made.glb", *skeleton, **options)
+        yield case, ("dance.glb", (folder / "made.glb").read_bytes())
+
+
+def test_the_page_reads_animations_as_python_does(tmp_path, caplog):
+    compare(tmp_path, caplog, dict(glb_files(tmp_path)))
+
+
+def animation_file(folder, times=None, turns=None, wrong=None, **document):
+    """A GLB file of one node that turns, or of something near it. wrong: changes what the writer's views say."""
+    writer = GlbWriter()
+    times = writer.array("SCALAR", np.arange(2.0) if times is None else np.asarray(times, float))
+    turns = writer.array("VEC4", np.tile([0.0, 0, 0, 1], (2, 1)) if turns is None else np.asarray(turns, float))
+    channels = [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}]
+    animation = {"channels": channels, "samplers": [{"input": times, "output": turns}]}
+    for view in writer.views:
+        view.update(wrong or {})
+    writer.write(folder / "a.glb", {"nodes": [{"name": "Hips"}], "animations": [animation]} | document)
+    return (folder / "a.glb").read_bytes()
+
+
+def test_a_glb_that_is_no_motion_gets_one_line(tmp_path):
+    compression = {"extensions": {"EXT_meshopt_compression": {"buffer": 1, "count": 2, "byteStride": 4}}}
+    whole = animation_file(tmp_path)
+    cases = {
+        "nothing": (b"", "not a GLB file, or cut short"),
+        "text": (b"hello, this is no file of numbers", "not a GLB file"),
+        "cut short": (whole[:-8], "cut short"),
+        "still": (animation_file(tmp_path, animations=[]), "without an animation: expected a skeleton in motion"),
+        "names": (whole, "expected the names of"),
+        "compressed": (animation_file(tmp_path, wrong=compression), "compressed (EXT_meshopt_compression)"),
+        "outside": (animation_file(tmp_path, wrong={"buffer": 1}), "numbers in another file"),
+        "too far": (animation_file(tmp_path, wrong={"byteOffset": 10**6}), "but there are"),
+        "order": (animation_file(tmp_path, times=[1, 0]), "one rotation for each of increasing times"),
+        "few": (animation_file(tmp_path, turns=[[0, 0, 0, 1]]), "one rotation for each of increasing times"),
+        "infinite": (animation_file(tmp_path, turns=[[0, 0, 0, np.inf]] * 2), "rotation: expected finite numbers"),
+        "circle": (animation_file(tmp_path, nodes=[{"children": [1]}, {"children": [0]}]), "below itself"),
+        "two parents": (animation_file(tmp_path, nodes=[{"children": [1, 1]}, {}]), "has two parents"),
+        "no node": (animation_file(tmp_path, nodes=[{"children": ["constructor"]}]), "is no node"),
+        "skin": (animation_file(tmp_path, skins=[{"joints": [7]}]), "a joint that is no node"),
+        "missing": (animation_file(tmp_path, skins=[{"joints": [0], "inverseBindMatrices": 9}]), "a damaged GLB file"),
+    }
+    found = page_reads([("a.glb", content) for content, _ in cases.values()])
+    for (case, (_, expected)), page in zip(cases.items(), found, strict=True):
+        message = page.get("error", "")
+        assert message.startswith("a.glb: ") and expected in message and "\n" not in message, (case, page)
+        assert not page["asksRate"], case
+
+
 def compare(tmp_path, caplog, files):
     """files: (name, bytes) by what they are."""
     for (case, (name, content)), page in zip(files.items(), page_reads(files.values()), strict=True):
@@ -178,7 +256,7 @@ def compare(tmp_path, caplog, files):
         np.testing.assert_allclose(theirs, matrices(motion.rotations), atol=EXACT, err_msg=case)
         np.testing.assert_allclose(page["translations"], motion.translations, atol=EXACT, err_msg=case)
         assert page["fps"] == pytest.approx(motion.fps, rel=1e-6), case
-        said = " ".join(caplog.messages)
+        said = " ".join(caplog.messages).replace(HOW_TO_CHANGE, "")
         assert bool(page["said"]) == bool(said) and page["said"] in said, (case, page["said"], said)
 
 
@@ -221,6 +299,20 @@ BAD = {
         "expected the names of",
     ),
 }
+
+
+def test_files_without_a_rate_are_read_at_the_one_that_is_asked_for():
+    """Without it the error says that a rate would do, and only then."""
+    asks = {"rate", "no rate", "slow", "negative", "instant"}
+    files = {case: (name, content) for case, (name, content, _) in BAD.items()}
+    for case, page in zip(files, page_reads(files.values()), strict=True):
+        assert page["asksRate"] == (case in asks), case
+    answered = [(*files[case], 12.5) for case in asks - {"instant"}]
+    for page in page_reads([*answered, ("dance.npz", npz(**POSES, fps=30), 60)]):
+        assert page["fps"] in (12.5, 60) and len(page["quats"]) == 2
+    timeless = skeletons()["A-pose"].replace("Frame Time: 0.0083333", "Frame Time: 0")
+    (page,) = page_reads([("dance.bvh", timeless.encode(), 25)])
+    assert page["fps"] == 25
 
 
 def test_the_page_refuses_what_it_cannot_draw():

@@ -225,7 +225,7 @@ class _MotionFile(ArrayFile):
         if form.fps is None:
             raise MotionError(self.path, key, "missing: how many frames are a second? expected fps, or this key")
         if not form.fixed:
-            self.said.append(NO_RATE.format(form.fps))
+            self.said.append(f"{NO_RATE.format(form.fps)}, which fps= changes")
         return form.fps
 
 

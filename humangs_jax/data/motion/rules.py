@@ -27,7 +27,7 @@ COLUMNS = {3 * len(JOINT_NAMES): "SMPL-X", BODY_NUMBERS + 2 * HAND_NUMBERS: "SMP
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
 """R R^T of a rotation matrix in a file is this near to 1."""
-NO_RATE = "the file says no frames per second: taken for {:g}, which fps= changes"
+NO_RATE = "the file says no frames per second: taken for {:g}"
 NO_PLACES = "the file has no positions ({}): people stay in place"
 
 # Names of joints --------------------------------------------------------------------------------------------------------

@@ -1,26 +1,32 @@
-// Motions that people drop onto the page: .npz (ours, AMASS and others) and .bvh (skeletons.js). Formats and their conventions are
-// those of humangs_jax/data/motion/, and so are the tables (RULES, from rules.py); a file that is refused says in one line what was
-// expected. What comes from a file is never the key of an object, which has keys of its own such as "constructor".
+// Motions that people drop onto the page: .npz (ours, AMASS and others), .bvh (skeletons.js) and .glb
+// (glb.js). Formats and their conventions are those of humangs_jax/data/motion/, and so are the tables
+// (RULES, from rules.py); a file that is refused says in one line what was expected. What comes from a
+// file is never the key of an object, which has keys of its own such as "constructor".
 
 const LARGEST_FILE = 512 * 2 ** 20;
 
 // { quats, translations, fps, said } for the scene's joints; said: what is to be told about the file.
-async function readMotionFile(file, scene) {
+// rate: frames per second that somebody has said; null: those of the file. An error that asksRate can be
+// answered with one.
+async function readMotionFile(file, scene, rate = null) {
   if (file.size > LARGEST_FILE) throw new Error(`${file.name}: larger than 512 MB`);
-  const bytes = new Uint8Array(await file.arrayBuffer());
+  const bytes = new Uint8Array(await file.arrayBuffer()), text = () => new TextDecoder().decode(bytes);
   try {
-    if (/\.bvh$/i.test(file.name)) return checkedMotion(retargetBvh(parseBvh(new TextDecoder().decode(bytes)), scene));
-    if (/\.(npz|smpl)$/i.test(file.name)) return checkedMotion(motionFromArrays(await readNpz(bytes), scene));
+    if (/\.bvh$/i.test(file.name)) return checkedMotion(retargeted(parseBvh(text(), rate), scene));
+    if (/\.(glb|vrma)$/i.test(file.name)) return checkedMotion(retargeted(parseGlb(bytes), scene));
+    if (/\.(npz|smpl)$/i.test(file.name)) return checkedMotion(motionFromArrays(await readNpz(bytes), scene, rate));
   } catch (error) {
-    throw new Error(`${file.name}: ${error.message}`);
+    throw Object.assign(new Error(`${file.name}: ${error.message}`), { asksRate: Boolean(error.asksRate) });
   }
-  throw new Error(`${file.name}: expected a motion as .npz (ours, AMASS) or .bvh`);
+  throw new Error(`${file.name}: expected a motion as .npz (ours, AMASS), .bvh or .glb`);
 }
+
+const rateError = (message) => Object.assign(new Error(message), { asksRate: true });
 
 // Numbers that cannot be drawn would stop the page.
 function checkedMotion(motion) {
   if (!(motion.fps > 0 && Number.isFinite(motion.fps) && Number.isFinite(1 / motion.fps)))
-    throw new Error(`expected a positive number of frames per second, got ${motion.fps}`);
+    throw rateError(`expected a positive number of frames per second, got ${motion.fps}`);
   if (!motion.quats.every((frame) => frame.every((q) => q.every(Number.isFinite)))) throw new Error("expected rotations and a skeleton of finite size");
   const farthest = largest(motion.translations.flat().map(Math.abs));
   if (!(farthest <= RULES.LARGEST_DISTANCE))
@@ -90,7 +96,7 @@ function toRowMajor(data, shape) {
   return out;
 }
 
-function motionFromArrays(arrays, scene) {
+function motionFromArrays(arrays, scene, asked = null) {
   const format = RULES.FORMATS.find(({ keys }) => keys.every((key) => arrays.has(key)));
   if (!format) {
     const expected = [...new Set(RULES.FORMATS.map(({ keys }) => keys[0]))].join(", ");
@@ -114,9 +120,11 @@ function motionFromArrays(arrays, scene) {
   const first = (keys) => keys.find((key) => arrays.has(key)) ?? keys[0];
   const poses = posesOf(format, numbers, arrays, count), key = first(format.moves);
   const still = format.stays && !arrays.has(key), moves = still ? null : numbers(key, [3], poses.length);
-  const rate = first(format.rates), given = arrays.has(rate), fps = given ? arrays.get(rate).data[0] : format.fps;
-  if (fps === null) throw new Error(`key ${rate}: missing: how many frames are a second?`);
-  if (!(fps > 0 && Number.isFinite(fps))) throw new Error(`key ${rate}: expected a positive number of frames per second, got ${fps}`);
+  const rate = first(format.rates), given = asked !== null || arrays.has(rate);
+  const fps = asked ?? (given ? arrays.get(rate).data[0] : format.fps);
+  if (fps === null) throw rateError(`key ${rate}: missing: how many frames are a second?`);
+  if (!(fps > 0 && Number.isFinite(fps)))
+    throw rateError(`key ${rate}: expected a positive number of frames per second, got ${fps}`);
   const scale = format.scaling === null ? 1 : arrays.get(format.scaling)?.data[0] ?? RULES.MILLIMETRES;
   if (!(scale > 0)) throw new Error(`key ${format.scaling}: expected a positive number, got ${scale}`);
   const translations = poses.map((_, f) => (still ? [0, 0, 0] : scaled(moves.row(f), 1 / scale)));

@@ -2,21 +2,29 @@
 
 const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
 
-// Joints with offsets, parents and channels, and the frames' numbers. A joint's name ends with its line or before a brace.
-function parseBvh(text) {
+// A clip, which is a skeleton in motion: { joints: [{ name, parent }], place, own, fps, up, said }.
+// place: joints in the rest pose, in which nothing is turned. own: of each frame { world: rotations from
+// the rest pose, position }. up: the axis that the format says is up; null: found from the rest pose.
+// A joint's name in a BVH file ends with its line or before a brace. rate: frames per second in place of
+// the file's; null: the file's.
+function parseBvh(text, rate = null) {
   text = text.replace(/^\ufeff/, "");
   if (!/^\s*HIERARCHY(?!\S)/.test(text)) throw new Error("not a BVH file: expected HIERARCHY first");
   const found = /(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)/.exec(text);
   const joints = bvhJoints(text.slice(text.indexOf("HIERARCHY") + 9, found ? found.index : text.length));
   if (!found) throw new Error("cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints");
-  const count = bvhNumber(found[1]), seconds = bvhNumber(found[2]), width = joints.reduce((sum, j) => sum + j.channels.length, 0);
-  if (!(count >= 1 && Number.isInteger(count) && seconds > 0 && Number.isFinite(1 / seconds)))
-    throw new Error(`expected at least one frame and a positive Frame Time, got ${found[1]} and ${found[2]}`);
+  const count = bvhNumber(found[1]), seconds = rate === null ? bvhNumber(found[2]) : 1 / rate;
+  const width = joints.reduce((sum, j) => sum + j.channels.length, 0);
+  const expected = `expected at least one frame and a positive Frame Time, got ${found[1]} and ${found[2]}`;
+  if (!(count >= 1 && Number.isInteger(count))) throw new Error(expected);
+  if (!(seconds > 0 && Number.isFinite(1 / seconds))) throw rateError(expected);
   const words = text.slice(found.index + found[0].length).split(/\s+/).filter(Boolean);
   if (width === 0 || words.length !== count * width)
     throw new Error(`expected ${count} frames of ${width} numbers, got ${words.length} numbers: cut short?`);
   const frames = Array.from({ length: count }, (_, f) => words.slice(f * width, (f + 1) * width).map(bvhNumber));
-  return { joints, frames, fps: 1 / seconds };
+  const place = joints.map(() => [0, 0, 0]);  // parents stand before their children
+  joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
+  return { joints, place, own: frames.map((numbers) => poseBvh(joints, numbers)), fps: 1 / seconds, up: null, said: "" };
 }
 
 function bvhNumber(word) {
@@ -59,7 +67,7 @@ function bvhJoints(text) {
 
 // A Map from each joint of ours that the file has to the index of the file's: as humangs_jax/data/motion/matching.py. place, posed:
 // in the rest pose and in the first frame.
-function matchBvh(joints, scene, place, posed) {
+function matchJoints(joints, scene, place, posed) {
   const parents = joints.map((j) => j.parent), plain = plainNames(joints.map((j) => j.name));
   let source = namedJoints(plain);
   if (source.has("left_hip") && source.has("right_hip")) {
@@ -214,10 +222,11 @@ const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
 // Bones point where the file's bones point. A joint's rest frames are related by the rotation that turns our rest direction into the
 // file's, carried down from the pelvis, whose is fixed by the hips' line and the up direction of the spine. Where nobody can stand
 // like the rest pose, twists are 0 on average over the frames.
-function retargetBvh(bvh, scene) {
-  const place = bvh.joints.map(() => [0, 0, 0]);  // rest positions: parents stand before their children
-  bvh.joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
-  const own = bvh.frames.map((numbers) => poseBvh(bvh, numbers)), source = matchBvh(bvh.joints, scene, place, own[0].position);
+function retargeted(clip, scene) {
+  const lacking = RULES.NEEDED.filter((name) => !scene.names.includes(name));
+  if (lacking.length)
+    throw new Error(`skeletons move bodies of SMPL-X's joints, this avatar has no ${lacking.join(", ")}`);
+  const { place, own } = clip, source = matchJoints(clip.joints, scene, place, own[0].position);
   const between = (a, b) => subtract(place[source.get(b)], place[source.get(a)]), theirs = (a, b) => normalized(between(a, b));
   const rest = (name) => scene.rest[scene.names.indexOf(name)];
   const top = RULES.TOPS.find((name) => source.has(name)), spine = theirs("pelvis", top), tall = nearestAxis(spine).axis;
@@ -227,7 +236,9 @@ function retargetBvh(bvh, scene) {
     return sum + Math.hypot(...subtract(at(b), at(a)));
   }, 0);
   const scale = legs(rest) / Math.max(legs((name) => own[0].position[source.get(name)]), 1e-9);  // units, and the length of the steps
-  const { up, said } = upOfBvh(own, source, top, scale, standing ? tall : "y", bvh.fps), upright = uprightMatrix(up);
+  const usual = standing ? tall : "y", known = { up: clip.up, said: "" };
+  const found = clip.up ? known : upOfClip(own, source, top, scale, usual, clip.fps);
+  const upright = uprightMatrix(found.up);
   const posed = own.map(({ world, position }) => (
     { world: world.map((m) => matrixMultiply(upright, m)), position: position.map((p) => matrixApply(upright, p)) }
   ));
@@ -240,7 +251,7 @@ function retargetBvh(bvh, scene) {
     frameOf(theirs("right_hip", "left_hip"), spine),
     transposed(frameOf(subtract(rest("left_hip"), rest("right_hip")), subtract(rest(top), rest("pelvis")))),
   );
-  const pelvis = pelvisTurns(bvh.joints, source, place, posed, top);
+  const pelvis = pelvisTurns(clip.joints, source, place, posed, top);
   const align = [], global = posed.map(() => []);  // our rest frame -> the file's rest frame; our joints in the world
   for (const j of scene.order) {
     const name = scene.names[j], p = scene.parents[j], at = source.get(name);
@@ -272,14 +283,15 @@ function retargetBvh(bvh, scene) {
   const low = standing ? soles(place, source, uprightMatrix(tall), restScale) : null;
   const steps = stepsOf(posed, source, scale, low), ofBody = stepsOfBody(global, scene, source, moves);
   const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - ofBody[f], 0]), rest("pelvis")));
-  const whole = Math.round(bvh.fps);  // BVH has 0.0083333 for 120
-  return { quats, translations, fps: Math.abs(bvh.fps - whole) < RULES.RATE_ROUNDING * bvh.fps ? whole : bvh.fps, said };
+  const whole = Math.round(clip.fps);  // BVH has 0.0083333 for 120
+  const fps = Math.abs(clip.fps - whole) < RULES.RATE_ROUNDING * clip.fps ? whole : clip.fps;
+  return { quats, translations, fps, said: [clip.said, found.said].filter(Boolean).join("; ") };
 }
 
 const NEXT = new Map(Object.entries(RULES.NEXT));
 
 // { up, said }: BVH does not tell which axis is up, a rest pose in which people stand does.
-function upOfBvh(posed, source, top, scale, usual, fps) {
+function upOfClip(posed, source, top, scale, usual, fps) {
   const trunks = posed.map(({ position }) => normalized(subtract(position[source.get(top)], position[source.get("pelvis")])));
   const { axis, cosine } = nearestAxis([0, 1, 2].map((i) => mean(trunks.map((v) => v[i]))));
   if (!(cosine >= RULES.CLEARLY_UP) || axis === usual) return { up: usual, said: "" };
@@ -371,7 +383,7 @@ function stepsOfBody(global, scene, source, moves) {
 }
 
 // Rotations and places of all joints in the world.
-function poseBvh({ joints }, numbers) {
+function poseBvh(joints, numbers) {
   const axes = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }, world = [], position = [];
   let at = 0;
   joints.forEach((joint, i) => {
