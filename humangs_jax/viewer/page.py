@@ -221,7 +221,7 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
 
 SCRIPTS = (
     *("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "glb"),
-    *("controls", "main"),
+    *("controls", "saving", "embedding", "main"),
 )
 SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
 LARGEST_FPS = 60.0

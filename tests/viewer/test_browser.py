@@ -114,6 +114,7 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
         await humangs.settle();"""
     )
     taller, view = content_height(browser), browser.run("return humangs.view()")
+    said = browser.run("return [...document.querySelectorAll('#shape .slider')].map((row) => row.innerText.split(/\\s*\\n\\s*/))")
     browser.run("document.getElementById('reset-shape').click(); await humangs.settle();")
     assert taller > content_height(browser) * 1.01
     from humangs_jax.viewer.page import known_body
@@ -123,6 +124,8 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
     at = body.shape_names.index("height")
     own = browser.run("return humangs.view()")["betas"]
     assert view["betas"][at] == pytest.approx(own[at] + 1) and view["betas"][:at] == own[:at]
+    assert [name for name, _ in said[:3]] == ["female to male", "young to old", "weight"]
+    assert [float(value) for _, value in said] == pytest.approx(view["betas"], abs=0.051)
 
 
 def content_height(browser):
@@ -276,7 +279,7 @@ def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, 
 def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):
     before = browser.run("return document.getElementById('motion-name').textContent")
     said = drop(browser, "notes.txt", b"hello")
-    assert said.startswith("notes.txt") and "expected a motion as .npz (ours, AMASS) or .bvh" in said and "\n" not in said
+    assert said.startswith("notes.txt") and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in said and "\n" not in said
     assert browser.run("return document.getElementById('motion-name').textContent") == before
 
 

@@ -1,10 +1,11 @@
 #version 300 es
-// The splats over a plain colour, and if wanted a floor with soft shadows below the feet.
+// The splats over a plain colour or over nothing, and if wanted a floor with soft shadows below the feet.
 precision highp float;
 precision highp sampler2D;
 
 uniform sampler2D splats;        // premultiplied
 uniform vec3 background;
+uniform float opaque;            // 0: nothing is behind the splats, and the result is premultiplied
 uniform float ground;            // 0: none, 1: full
 uniform float floor_height;
 uniform vec3 eye;
@@ -23,32 +24,37 @@ float lines(vec2 p, vec2 width) {
   return 1.0 - min(min(away.x, away.y), 1.0);
 }
 
-vec3 with_floor(vec3 plain, vec3 ray) {
+// Lines and shadows of the floor, premultiplied, to be laid over the plain colour.
+vec4 floor_layer(vec3 plain, vec3 ray) {
   float t = (floor_height - eye.y) / ray.y;
-  if (ray.y > -1e-3 || t < 0.0) return plain;        // seen from below, or above the horizon
+  if (ray.y > -1e-3 || t < 0.0) return vec4(0.0);    // seen from below, or above the horizon
   vec2 p = (eye + t * ray).xz;
   float fade = smoothstep(3.2, 0.4, length(p - middle)) * smoothstep(0.0, 0.12, -normalize(ray).y);
-  if (fade == 0.0) return plain;
+  if (fade == 0.0) return vec4(0.0);
   // how p moves from one pixel to the next, in both directions of the image
   vec3 right = vec3(camera_rotation[0][0], camera_rotation[1][0], camera_rotation[2][0]) / K.x;
   vec3 down = vec3(camera_rotation[0][1], camera_rotation[1][1], camera_rotation[2][1]) / K.y;
   vec2 dx = t * (right - ray * (right.y / ray.y)).xz, dy = t * (down - ray * (down.y / ray.y)).xz;
   float light = dot(plain, vec3(0.299, 0.587, 0.114)), line = lines(p, abs(dx) + abs(dy));
-  vec3 behind = mix(plain, light > 0.4 ? vec3(0.0) : vec3(1.0), ground * 0.085 * line * fade);
+  vec3 ink = light > 0.4 ? vec3(0.0) : vec3(1.0);
+  float inked = ground * 0.085 * line * fade;
   float shadow = 0.0;
   for (int i = 0; i < 3; i++) {
     vec2 d = (p - shadows[i].xy) / SHADOW;
     shadow = max(shadow, shadows[i].z * exp(-0.5 * dot(d, d)));
   }
-  return behind * (1.0 - ground * 0.3 * shadow);
+  float lit = 1.0 - ground * 0.3 * shadow;
+  return vec4(ink * inked * lit, 1.0 - (1.0 - inked) * lit);
 }
 
 void main() {
   vec4 front = texelFetch(splats, ivec2(gl_FragCoord.xy), 0);
-  vec3 behind = background;
+  vec4 behind = opaque * vec4(background, 1.0);
   if (ground > 0.0) {
     vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
-    behind = with_floor(background, transpose(camera_rotation) * vec3((pixel - K.zw) / K.xy, 1.0));
+    vec3 ray = transpose(camera_rotation) * vec3((pixel - K.zw) / K.xy, 1.0);
+    vec4 layer = floor_layer(background, ray);
+    behind = layer + (1.0 - layer.a) * behind;
   }
-  result = vec4(front.rgb + (1.0 - front.a) * behind, 1.0);
+  result = front + (1.0 - front.a) * behind;
 }

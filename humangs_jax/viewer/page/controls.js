@@ -1,25 +1,38 @@
 // Everything people click, drag or press. `app` (main.js) holds the state; controls change it and say so.
 
 const BACKGROUNDS = ["#f6f5f2", "#ffffff", "#c9d3dc", "#4c5158", "#15171a"];
+// What turns about x (to the left), y (up) and z (to the front) of the T-pose do, by where the bone points.
+const UPRIGHT_TURNS = ["bend", "turn", "lean"];
+const ARM_TURNS = ["twist", "front, back", "up, down"];
+const LEG_TURNS = ["front, back", "twist", "sideways"];
+const FACE_TURNS = ["up, down", "left, right", "roll"];
+const FINGER_TURNS = ["twist", "spread", "curl"];
+const PLAIN_TURNS = ["turn", "turn", "turn"];
+// Title, joints, how far they turn in degrees, and what the turns do.
 const GROUPS = [
-  ["Torso and head", /^(pelvis|spine\d|neck|head)$/, 50],
-  ["Left arm", /^left_(collar|shoulder|elbow|wrist)$/, 120],
-  ["Right arm", /^right_(collar|shoulder|elbow|wrist)$/, 120],
-  ["Left leg", /^left_(hip|knee|ankle|foot)$/, 110],
-  ["Right leg", /^right_(hip|knee|ankle|foot)$/, 110],
-  ["Face", /^(jaw|left_eye|right_eye)$/, 30],
-  ["Left hand", /^left_(index|middle|pinky|ring|thumb)\d$/, 90],
-  ["Right hand", /^right_(index|middle|pinky|ring|thumb)\d$/, 90],
-  ["Other", /./, 90],
+  ["Torso and head", /^(pelvis|spine\d|neck|head)$/, 50, UPRIGHT_TURNS],
+  ["Left arm", /^left_(collar|shoulder|elbow|wrist)$/, 120, ARM_TURNS],
+  ["Right arm", /^right_(collar|shoulder|elbow|wrist)$/, 120, ARM_TURNS],
+  ["Left leg", /^left_(hip|knee|ankle|foot)$/, 110, LEG_TURNS],
+  ["Right leg", /^right_(hip|knee|ankle|foot)$/, 110, LEG_TURNS],
+  ["Face", /^(jaw|left_eye|right_eye)$/, 30, FACE_TURNS],
+  ["Left hand", /^left_(index|middle|pinky|ring|thumb)\d$/, 90, FINGER_TURNS],
+  ["Right hand", /^right_(index|middle|pinky|ring|thumb)\d$/, 90, FINGER_TURNS],
+  ["Other", /./, 90, PLAIN_TURNS],
 ];
+const PLAIN_SHAPES = new Map([["sex_male", "female to male"], ["age", "young to old"]]);
 const SHAPE_REACH = 1.5;  // how far a shape slider goes from the person's own value
 
 const element = (id) => document.getElementById(id);
 const plainName = (name) => name.replace(/_/g, " ").replace(/(\D)(\d)$/, "$1 $2");
+const plainShape = (name) => PLAIN_SHAPES.get(name) ?? plainName(name);
+const inDegrees = (value) => `${round(value)}°`;
+const signed = (value) => `${value > 0 ? "+" : ""}${value.toFixed(1)}`.replace("-0.0", "0.0").replace("+0.0", "0.0");
+const counted = (amount, thing) => `${amount.toLocaleString("en")} ${thing}${amount === 1 ? "" : "s"}`;
 
 function makeControls(app) {
   const { scene } = app;
-  element("facts").textContent = `${scene.count.toLocaleString("en")} Gaussians`;
+  element("facts").textContent = counted(scene.count, "Gaussian");
 
   for (const button of element("modes").children) button.onclick = () => app.setMode(button.dataset.mode);
   element("play").onclick = () => app.setPlaying(!app.playing);
@@ -29,7 +42,7 @@ function makeControls(app) {
   element("ground").onchange = (event) => { app.look.ground = event.target.checked ? 1 : 0; app.invalidate(); };
   element("follow").onchange = (event) => { app.follow = event.target.checked; app.invalidate(); };
   element("frame-person").onclick = () => app.framePerson();
-  element("save-image").onclick = () => app.saveImage();
+  element("show-help").onclick = () => element("help").showModal();
   element("reset-joints").onclick = () => resetJoints();
   element("reset-shape").onclick = () => resetShape();
   const showPanel = (open) => {
@@ -52,8 +65,11 @@ function makeControls(app) {
   anyColor.oninput = () => setBackground(anyColor.value);
   element("swatches").append(...swatches, anyColor);
   function setBackground(color) {
-    app.look.background = [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16) / 255);
-    anyColor.value = color;
+    app.look.transparent = color === "transparent";
+    document.documentElement.classList.toggle("transparent", app.look.transparent);
+    const opaque = app.look.transparent ? "#ffffff" : color;
+    app.look.background = [1, 3, 5].map((i) => parseInt(opaque.slice(i, i + 2), 16) / 255);
+    anyColor.value = opaque;
     swatches.forEach((s, i) => s.setAttribute("aria-pressed", String(BACKGROUNDS[i] === color)));
     document.documentElement.classList.toggle("dark", dot(app.look.background, [0.3, 0.59, 0.11]) < 0.45);
     document.body.style.background = color;
@@ -62,16 +78,27 @@ function makeControls(app) {
   setBackground(BACKGROUNDS[0]);
 
   // ---- sliders ----
-  const slider = (label, low, high, value, step, oninput) => {
-    const input = Object.assign(document.createElement("input"), { type: "range", min: low, max: high, step, value, title: label });
+  // A row: what the slider does, the slider, and its value. label: the whole of it in words.
+  // home: where a double click goes.
+  const sliderRow = (caption, label, { low, high, value, home, step, shown }, onchange) => {
+    const made = (tag, properties) => Object.assign(document.createElement(tag), properties);
+    const input = made("input", { type: "range", min: low, max: high, step, value, title: label });
+    const row = made("label", { className: "slider" }), output = made("output", {});
+    const name = made("span", { textContent: caption });
     input.setAttribute("aria-label", label);
-    const home = value;
-    input.oninput = () => oninput(Number(input.value));
-    input.ondblclick = () => { input.value = home; oninput(home); };
-    return input;
+    const show = () => {
+      output.textContent = shown(Number(input.value));
+      input.setAttribute("aria-valuetext", output.textContent);
+    };
+    input.set = (to) => { input.value = to; show(); };
+    input.oninput = () => { show(); onchange(Number(input.value)); };
+    input.ondblclick = () => { input.set(home); onchange(home); };
+    row.append(name, input, output);
+    show();
+    return row;
   };
   const taken = new Set(), marks = [];
-  for (const [title, pattern, reach] of GROUPS) {
+  for (const [title, pattern, reach, turns] of GROUPS) {
     const members = scene.names.map((name, j) => [name, j]).filter(([name, j]) => pattern.test(name) && !taken.has(j));
     if (!members.length) continue;
     members.forEach(([, j]) => taken.add(j));
@@ -81,19 +108,19 @@ function makeControls(app) {
     marks.push([summary, members.map(([, j]) => j)]);
     details.addEventListener("toggle", () => {  // 165 sliders: made when they are first seen
       if (details.childElementCount > 1) return;
-      const heads = Object.assign(document.createElement("div"), { className: "joint heads", innerHTML: "<div><b>x</b><b>y</b><b>z</b></div>" });
-      details.append(heads);
       for (const [name, j] of members) {
-        const row = document.createElement("div"), caption = document.createElement("span"), axes = document.createElement("div");
-        row.className = "joint";
-        caption.textContent = plainName(name);
-        for (let axis = 0; axis < 3; axis++)
-          axes.append(slider(`${plainName(name)}, about ${"xyz"[axis]}, degrees`, -reach, reach, app.degrees[j][axis], 0.5, (v) => {
+        const joint = Object.assign(document.createElement("div"), { className: "joint" });
+        joint.append(Object.assign(document.createElement("b"), { textContent: plainName(name) }));
+        turns.forEach((does, axis) => {
+          const letter = "xyz"[axis], label = `${plainName(name)}, about ${letter} (${does}), degrees`;
+          const value = app.degrees[j][axis];
+          const range = { low: -reach, high: reach, value, home: 0, step: 0.5, shown: inDegrees };
+          joint.append(sliderRow(`${letter}: ${does}`, label, range, (v) => {
             app.degrees[j][axis] = v;
             jointsChanged();
           }));
-        row.append(caption, axes);
-        details.append(row);
+        });
+        details.append(joint);
       }
     });
     element("joints").append(details);
@@ -106,40 +133,55 @@ function makeControls(app) {
   }
   function resetJoints() {
     app.degrees.forEach((d) => d.fill(0));
-    for (const input of element("joints").querySelectorAll("input")) input.value = 0;
+    for (const input of element("joints").querySelectorAll("input")) input.set(0);
     jointsChanged();
   }
   const { shape } = scene.header;
   if (shape) {
     element("shape-section").hidden = false;
     shape.names.forEach((name, s) => {
-      const row = document.createElement("label"), caption = document.createElement("span"), own = shape.betas[s];
-      row.className = "row";
-      caption.textContent = plainName(name);
-      row.append(caption, slider(plainName(name), own - SHAPE_REACH, own + SHAPE_REACH, own, 0.01, (v) => {
+      const home = shape.betas[s], low = home - SHAPE_REACH, high = home + SHAPE_REACH;
+      const range = { low, high, value: home, home, step: 0.01, shown: signed };
+      element("shape").append(sliderRow(plainShape(name), plainShape(name), range, (v) => {
         app.setShape(app.betas.map((b, i) => (i === s ? v : b)));
         element("reset-shape").hidden = false;
       }));
-      element("shape").append(row);
     });
   }
   function resetShape() {
-    [...element("shape").querySelectorAll("input")].forEach((input, s) => { input.value = shape.betas[s]; });
+    [...element("shape").querySelectorAll("input")].forEach((input, s) => input.set(shape.betas[s]));
     app.setShape([...shape.betas]);
     element("reset-shape").hidden = true;
   }
 
   // ---- files ----
-  async function openMotion(file) {
+  // rate: frames per second that somebody has said; null: those of the file.
+  async function openMotion(file, rate = null) {
     if (!file) return;
+    element("ask-rate").hidden = true;
     try {
-      const motion = await readMotionFile(file, scene);
+      const motion = await readMotionFile(file, scene, rate);
       app.setMotion(motion, file.name);
-      say(`${file.name}: ${scene.motion.quats.length} frames${motion.said ? `; ${motion.said}` : ""}`);
+      say(`${file.name}: ${counted(scene.motion.quats.length, "frame")}${motion.said ? `; ${motion.said}` : ""}`);
     } catch (error) {
-      say(error.message, true);
+      if (error.asksRate) askRate(file, error.message);
+      else say(error.message, true);
     }
   }
+  function askRate(file, question) {
+    element("rate-question").textContent = question;
+    element("ask-rate").hidden = false;
+    element("ask-rate").onsubmit = (event) => {
+      event.preventDefault();
+      openMotion(file, element("rate-answer").valueAsNumber);
+    };
+    element("rate-answer").select();
+  }
+  element("leave-rate").onclick = () => { element("ask-rate").hidden = true; };
+  element("fps").onchange = (event) => {
+    if (scene.motion && event.target.checkValidity()) scene.motion.fps = event.target.valueAsNumber;
+    app.invalidate();
+  };
   let drags = 0;
   const dropping = (change) => { drags = Math.max(0, drags + change); document.body.classList.toggle("dropping", drags > 0); };
   addEventListener("dragenter", (event) => { event.preventDefault(); dropping(1); });
@@ -166,7 +208,7 @@ function makeControls(app) {
         g: () => element("ground").click(), p: () => element("toggle-panel").click(),
         h: () => { document.body.classList.toggle("hidden"); app.invalidate(); },
         b: () => { const at = BACKGROUNDS.indexOf(anyColor.value); setBackground(BACKGROUNDS[(at + 1) % BACKGROUNDS.length]); },
-        "[": () => changeSpeed(-1), "]": () => changeSpeed(1), "?": () => element("help").showModal(),
+        "[": () => changeSpeed(-1), "]": () => changeSpeed(1), "?": () => element("show-help").click(),
       })).get(key.toLowerCase());
       if (!act) return;
       act();
@@ -180,7 +222,13 @@ function makeControls(app) {
     select.onchange({ target: select });
   }
 
+  function setFloor(shown) {
+    element("ground").checked = shown;
+    element("ground").onchange({ target: element("ground") });
+  }
+
   return {
+    setBackground, setFloor,
     // Shows the state that changes without a click.
     update() {
       const { motion } = scene, moving = app.mode === "motion" && motion;
@@ -191,7 +239,10 @@ function makeControls(app) {
         button.setAttribute("aria-checked", String(button.dataset.mode === app.mode));
         if (button.dataset.mode === "motion") button.disabled = !motion;
       }
-      element("motion-name").textContent = motion ? `${app.motionName}: ${motion.quats.length} frames, ${round(motion.fps)} fps` : "no motion: drop a file";
+      const about = motion && `${app.motionName}: ${counted(motion.quats.length, "frame")}`;
+      element("motion-name").textContent = about || "no motion: drop a file";
+      element("rate-row").hidden = !motion;
+      if (motion && document.activeElement !== element("fps")) element("fps").value = round(motion.fps);
       if (!moving) return;
       const scrub = element("scrub"), last = motion.quats.length - 1;
       scrub.max = last;

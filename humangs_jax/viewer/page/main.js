@@ -3,18 +3,21 @@
 const LEAST_FRAME_MS = 45;   // slower than this, the resolution falls while things move
 const QUALITIES = [1, 0.75, 0.5];
 const STILL_MS = 250;        // after so long without a change the image is drawn at full resolution
+const LARGEST_PICTURE = 2 ** 24;  // pixels; some browsers make no more
 const PHONE = 640;           // pixels; as in style.css: the panel lies below
 const FOLLOW_SECONDS = 0.4;  // the camera follows the mean of the path over so long before and after
 
 async function start() {
+  document.body.classList.remove("unable");  // this browser reads the page's scripts
+  if (typeof DecompressionStream === "undefined") throw new Error("DecompressionStream is missing.");
   const scene = await readScene(), canvas = element("view"), renderer = makeRenderer(canvas, scene);
   const distance = (0.54 * scene.height) / Math.tan(FIELD_OF_VIEW / 2) + 0.3 * scene.height;
   const orbit = makeOrbit([0, 0.5 * scene.height, 0], distance), home = { ...orbit };
   const app = {
     scene, orbit, mode: scene.motion ? "motion" : "a", motionName: scene.header.motion?.name, frame: 0, playing: Boolean(scene.motion), speed: 1,
     degrees: scene.names.map(() => [0, 0, 0]), betas: scene.header.shape ? [...scene.header.shape.betas] : [],
-    follow: true, look: { background: [1, 1, 1], ground: 1 },
-    invalidate, setMode, setPlaying, setFrame, stepFrame, setShape, setMotion, framePerson, saveImage,
+    follow: true, look: { background: [1, 1, 1], transparent: false, ground: 1 },
+    invalidate, setMode, setPlaying, setFrame, stepFrame, setShape, setMotion, framePerson, picture, setRecording,
   };
   const still = { rest: restPose(scene.names.length), a: aPose(scene.names) };
   const hasFeet = ["left_foot", "right_foot"].map((name) => scene.names.indexOf(name)).filter((j) => j >= 0);
@@ -41,7 +44,7 @@ async function start() {
   }
 
   // ---- one image ----
-  let exact = null, quality = 0, lastDrawn = { camera: null, pose: null };
+  let exact = null, quality = 0, recordedSize = null, lastDrawn = { camera: null, pose: null };
 
   function currentPose() {
     const base = app.mode === "motion" && scene.motion ? motionPose(scene.motion, app.frame) : still[app.mode === "rest" ? "rest" : "a"];
@@ -53,9 +56,12 @@ async function start() {
     return { quats, translation };
   }
 
+  const fullRatio = () => Math.min(devicePixelRatio || 1, 2);
+  const sizeAt = (ratio) => [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+
   function currentCamera() {
-    const ratio = Math.min(devicePixelRatio || 1, 2) * QUALITIES[quality];
-    const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+    if (recordedSize) return orbitCamera(orbit, ...recordedSize, followed());
+    const ratio = fullRatio() * QUALITIES[quality], [width, height] = sizeAt(ratio);
     const panel = element("panel"), bar = element("transport"), below = bar.offsetHeight && bar.offsetHeight + 14;
     const [right, bottom] = innerWidth > PHONE ? [panel.offsetWidth && panel.offsetWidth + 14, below]
       : [0, panel.offsetHeight ? panel.offsetHeight + 68 : below];
@@ -93,7 +99,14 @@ async function start() {
   }
 
   function draw() {
-    drawPose(currentCamera(), currentPose(), app.look, false);
+    const look = recordedSize ? { ...app.look, transparent: false } : app.look;  // videos have no transparency
+    drawPose(currentCamera(), currentPose(), look, false);
+  }
+  function drawFull() {
+    const reduced = quality;
+    quality = 0;
+    draw();
+    quality = reduced;
   }
 
   // ---- the loop ----
@@ -119,7 +132,7 @@ async function start() {
     controls.showRate(frameMs ? 1000 / frameMs : 0, true);
     adapt();
     clearTimeout(stillTimer);
-    if (moving) invalidate();
+    if (moving || recordedSize) invalidate();
     else stillTimer = setTimeout(stand, STILL_MS);
   }
   let slow = 0;
@@ -134,11 +147,7 @@ async function start() {
     controls.showRate(frameMs ? 1000 / frameMs : 0, false);
     lastTime = null;
     frameMs = 0;
-    if (quality === 0 || exact) return;
-    const reduced = quality;
-    quality = 0;
-    draw();
-    quality = reduced;
+    if (quality > 0 && !exact) drawFull();
   }
 
   // ---- what controls do ----
@@ -182,16 +191,31 @@ async function start() {
     Object.assign(orbit, home, { target: [...home.target] });
     invalidate();
   }
-  function saveImage() {
-    draw();
-    canvas.toBlob((blob) => {
-      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${document.title}.png` });
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-    });
+  // { blob, width, height } of a PNG: what is on the screen, with the person in the middle and at full
+  // resolution, however low it is while things move. transparent: the person alone.
+  async function picture(scale, transparent) {
+    const { clientWidth, clientHeight } = canvas, most = Math.sqrt(LARGEST_PICTURE / (clientWidth * clientHeight));
+    const longest = renderer.longestSide / Math.max(clientWidth, clientHeight);
+    const [width, height] = sizeAt(Math.min(fullRatio() * scale, longest, most));
+    const look = transparent ? { ...app.look, transparent, ground: 0 } : app.look;
+    drawPose(orbitCamera(orbit, width, height, followed()), currentPose(), look, true);
+    const encoded = new Promise((resolve) => canvas.toBlob(resolve));  // of the pixels as they are now
+    if (app.playing) draw();
+    else drawFull();
+    return { blob: await encoded, width, height };
+  }
+  // While it is true the controls are hidden and the canvas keeps its size, which encoders want to be even.
+  function setRecording(recording) {
+    recordedSize = recording ? sizeAt(fullRatio()).map((length) => length + (length % 2)) : null;
+    document.body.classList.toggle("recording", recording);
+    if (recording) draw();
+    if (recording && app.mode === "motion") setPlaying(true);
+    invalidate();
   }
 
   const controls = makeControls(app);
+  makeSaving(app, canvas);
+  applyOptions(app, controls, location.search);
   app.steer = steerOrbit(orbit, canvas, invalidate, framePerson);
   new ResizeObserver(invalidate).observe(canvas);
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); location.reload(); });
@@ -305,8 +329,8 @@ window.humangs.ready = start().then(
   (hook) => { Object.assign(window.humangs, hook); return true; },
   (error) => {
     console.error(error);
-    say(error.message, true);
-    clearTimeout(messageTimer);  // it stays
+    document.body.classList.add("unable", "certain");
+    element("reason").textContent = error.message;
     throw error;
   },
 );

@@ -4,8 +4,8 @@
 const MOST_JOINTS = 256;  // of the uniform block in project.frag
 
 function makeRenderer(canvas, scene) {
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
-  if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
+  const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
+  if (!gl) throw new Error("WebGL 2 is missing.");
   // without it 8 bits hold what splats add up to: banding, but a picture
   const floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
 
@@ -58,7 +58,8 @@ function makeRenderer(canvas, scene) {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, image, 0);
   }
 
-  // camera: see camera.js. rows: joint transforms, Float32Array (12 j). look: { background, ground, floor, shadows, middle }.
+  // camera: see camera.js. rows: joint transforms, Float32Array (12 j).
+  // look: { background, transparent, ground, floor, shadows, middle }.
   function render(camera, rows, look) {
     const { width, height } = camera;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -98,7 +99,8 @@ function makeRenderer(canvas, scene) {
     gl.useProgram(over.program);
     bind(gl, 0, image);
     over.set({
-      splats: 0, background: look.background, ground: look.ground, floor_height: look.floor, eye: camera.eye,
+      splats: 0, background: look.background, opaque: look.transparent ? 0 : 1,
+      ground: look.ground, floor_height: look.floor, eye: camera.eye,
       camera_rotation: camera.rotation, K: camera.K, size: [width, height], shadows: look.shadows.flat(), middle: look.middle,
     });
     gl.bindVertexArray(nothing);
@@ -108,6 +110,7 @@ function makeRenderer(canvas, scene) {
 
   return {
     gl, render, floats: Boolean(floats),
+    longestSide: Math.min(gl.getParameter(gl.MAX_TEXTURE_SIZE), ...gl.getParameter(gl.MAX_VIEWPORT_DIMS)),
     setOrder(indices) {
       padded.set(indices);
       bind(gl, 0, order);
