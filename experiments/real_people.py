@@ -29,7 +29,8 @@ from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import Photos
 from humangs_jax.detection.people import Networks, bilinear
 from humangs_jax.fitting.fit_capture import fit_photos
-from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
+from humangs_jax.fitting.person_cameras import cameras_from_person
+from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.fitting.refine import CaptureRefineConfig, Scene, moved_capture, posed_vertices
 from humangs_jax.fitting.state import StateStd
 from humangs_jax.fitting.triangulation import Similarity, align_points

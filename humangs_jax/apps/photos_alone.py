@@ -22,7 +22,8 @@ from humangs_jax.data.calibration.photos import upright_mask
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import read_description
-from humangs_jax.fitting.person_cameras import PersonCameras, PersonViews, cameras_from_person
+from humangs_jax.fitting.person_cameras import PersonCameras, cameras_from_person
+from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.io.images import DIAGONAL_35MM, focal_length, image_size, resized, write_png
 
 LONGEST, LEAST_PERSON = 2048, 700

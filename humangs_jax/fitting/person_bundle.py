@@ -5,23 +5,30 @@ the person. Their depths are guesses, 5 to 10 cm off, and the whole is turned by
 several photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478) are a start. Bundle adjustment then
 needs the pixels only; the 3D landmarks keep the size, and what pixels leave open.
 
-On the host in float64: a hundred unknowns, and every number of photos would be another program to compile.
+What is minimised is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x, p_y) / p_z:
+
+    pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and McClure
+    world   sqrt(w) (X - mean_v(X) - W) / WORLD      W: the detector's 3D landmarks; means are weighted by w
+    size    (log r(X) - log r(W)) / SIZE             r: the root of all views' weighted mean square distances from the mean
+    bones   (|left bone| - |right bone|) / BONES
+    focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera
+
+A pixel depends on one landmark, one camera and one y. So the landmarks are eliminated (Schur complement: Triggs et al. 2000,
+"Bundle adjustment: a modern synthesis", section 6.1); what is left is a small system of the cameras.
+
+On the host in float64: every number of photos would be another program to compile.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.fitting.triangulation import align_points
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
-LANDMARK, TURN, PLACE = 0.05, 0.1, 0.1
-"""Metres, radians and shares of the distance that count as one unit of the unknowns."""
 WORLD = 0.15
 """Std of the detector's 3D landmarks, metres, shared errors included: pixels decide where several views see them."""
 BONES = 0.01
@@ -30,12 +37,20 @@ SIZE = 0.01
 """Std of the logarithm of the person's size against the detector's 3D landmarks: what keeps the scale."""
 ROBUST_SCALES = (40.0, 6.0)
 """Of pixels, standard deviations: the start is off by tens of them."""
-UNSEEN = 1e-4
-"""Weight of where landmarks start, for those that no photo shows."""
-STEPS, TOLERANCE = 60, 1e-9
-DIFFERENCE = 1e-6
-"""Step of the forward differences, units of the unknowns."""
+STEPS = 60
+"""Of Levenberg and Marquardt for each robust scale, at most, rejected ones included."""
+EXACT, COARSE = 1e-9, 1e-3
+"""Relative decrease of the cost that ends the search: of a result, and where costs are only compared."""
+DAMPING = 1e-3
+"""Share of the diagonal of the normal equations that is added to it at first."""
+STILL = 1e-6
+"""Added to that diagonal: what no residual moves stays where it is."""
+FURTHEST = 5.0
+"""Largest logarithm of the change of a depth in one step, and of a focal length in all, as multiples of e."""
 ALTERNATIONS = 20
+"""Of turns and mean shape: a mean of ten photos is still by then."""
+VIEW = 9
+"""Unknowns of a view: turn, place, and the mean of its turned landmarks."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -43,7 +58,8 @@ class Evidence:
     """Landmarks of a person in c photos. points: (c, k, 2) pixels from the principal point. weights: (c, k). noise: (c,) pixels.
 
     world: (c, k, 3) metres in camera axes about their weighted mean, all of one size. focal: (c,) pixels; focal_std: (c,) of
-    its logarithm. bones: (b, 2, 2) landmarks of left bones and of their right partners.
+    its logarithm. kinds: (c,) from 0: cameras of one kind keep the ratio of their focal lengths. bones: (b, 2, 2) landmarks of
+    left bones and of their right partners.
     """
 
     points: Float[np.ndarray, "c k 2"]
@@ -52,6 +68,7 @@ class Evidence:
     world: Float[np.ndarray, "c k 3"]
     focal: Float[np.ndarray, " c"]
     focal_std: Float[np.ndarray, " c"]
+    kinds: Int[np.ndarray, " c"]
     bones: Int[np.ndarray, "b 2 2"]
 
 
@@ -59,13 +76,16 @@ class Evidence:
 class Rig:
     """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3) take them to camera axes.
 
-    focal: (c,) pixels. While it is searched all of them have further axes in front.
+    focal: (c,) pixels.
     """
 
-    landmarks: Float[np.ndarray, "*n k 3"]
-    rotations: Float[np.ndarray, "*n c 3 3"]
-    places: Float[np.ndarray, "*n c 3"]
-    focal: Float[np.ndarray, "*n c"]
+    landmarks: Float[np.ndarray, "k 3"]
+    rotations: Float[np.ndarray, "c 3 3"]
+    places: Float[np.ndarray, "c 3"]
+    focal: Float[np.ndarray, " c"]
+
+
+# The start -----------------------------------------------------------------------------------------------------------
 
 
 def align_views(
@@ -75,20 +95,25 @@ def align_views(
     each view's axes.
     """
     shape, rotations = worlds[int(np.argmax(weights.sum(1)))], np.tile(np.eye(3), (len(worlds), 1, 1))
+    total = np.maximum(weights.sum(0), 1e-9)[:, None]
     for _ in range(ALTERNATIONS if len(worlds) > 1 else 0):
-        rotations = np.asarray([_turn(shape, *own) for own in zip(worlds, weights, strict=True)])
-        total = np.maximum(weights.sum(0), 1e-9)[:, None]
+        rotations = turns_onto(shape, worlds, weights)
         shape = np.einsum("ck,cba,ckb->ka", weights, rotations, worlds) / total
     return shape, rotations
 
 
-def _turn(
-    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "3 3"]:
-    try:
-        return align_points(source, target, weights).rotation
-    except ValueError:  # the points of a view lie on a line: any turn about it
-        return np.eye(3)
+def turns_onto(
+    shape: Float[np.ndarray, "k 3"], worlds: Float[np.ndarray, "c k 3"], weights: Float[np.ndarray, "c k"]
+) -> Float[np.ndarray, "c 3 3"]:
+    """The rotations (c, 3, 3) that bring a shape onto the landmarks of each view best (Kabsch 1976); of points on a line, one of
+    those.
+    """
+    share = weights / weights.sum(1, keepdims=True)
+    source = shape - (share @ shape)[:, None]
+    target = worlds - np.einsum("ck,cka->ca", share, worlds)[:, None]
+    u, _, vt = np.linalg.svd(np.einsum("ck,cka,ckb->cab", share, target, source))
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    return u @ vt
 
 
 def place_person(
@@ -112,83 +137,297 @@ def place_person(
     return np.asarray([*(share @ (xy * distance - offsets[:, :2])), distance])
 
 
-def adjust(evidence: Evidence, start: Rig) -> tuple[Rig, float]:
-    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the residuals."""
-    c, k = evidence.weights.shape
-    unknowns, cost = np.zeros(3 * k + 6 * c + 1), np.inf
-    for scale in ROBUST_SCALES:
-        of = lambda y, scale=scale: _residuals(evidence, start, y, scale)
-        found = least_squares(
-            lambda y, of=of: of(y[None])[0],
-            unknowns,
-            jac=lambda y, of=of: _jacobian(of, y),
-            method="lm",
-            max_nfev=STEPS,
-            xtol=TOLERANCE,
-            ftol=TOLERANCE,
-            gtol=TOLERANCE,
-        )
-        unknowns, cost = found.x, float(found.cost)
-    moved = _moved(evidence, start, unknowns[None])
-    return Rig(*(getattr(moved, field.name)[0] for field in dataclasses.fields(Rig))), cost
+# Residuals -----------------------------------------------------------------------------------------------------------
 
 
-def _jacobian(residuals: Callable[[np.ndarray], np.ndarray], y: Float[np.ndarray, " u"]) -> Float[np.ndarray, "r u"]:
-    """By forward differences, all at once."""
-    found = residuals(np.concatenate([y[None], y + DIFFERENCE * np.eye(len(y))]))
-    return (found[1:] - found[0]).T / DIFFERENCE
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rows:
+    """Residuals of a rig.
+
+    seen: (c, k, 5) pixels and world, of a landmark in a view. tied: (t,) size and bones, which tie landmarks to each other.
+    focal: (g,) the logarithms of the kinds' factors, standard deviations.
+    """
+
+    seen: Float[np.ndarray, "c k 5"]
+    tied: Float[np.ndarray, " t"]
+    focal: Float[np.ndarray, " g"]
+
+    @property
+    def cost(self) -> float:
+        """Half the square sum."""
+        return 0.5 * float(np.sum(self.seen**2) + np.sum(self.tied**2) + np.sum(self.focal**2))
 
 
-def _moved(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"]) -> Rig:
-    """Rigs of unknowns (n, 3 k + 6 c + 1): changes of landmarks, turns, places, and one of all focal lengths."""
-    c, k = evidence.weights.shape
-    landmarks, turns, change, focal = np.split(y, np.cumsum([3 * k, 3 * c, 3 * c]), axis=1)
-    landmarks, turns, change = (x.reshape(len(y), -1, 3) for x in (landmarks, turns, change))
-    matrices = Rotation.from_rotvec(TURN * turns.reshape(-1, 3)).as_matrix().reshape(len(y), c, 3, 3)
-    depth = start.places[:, 2] * np.exp(np.clip(PLACE * change[..., 2], -5, 5))  # never behind the camera
-    sideways = start.places[:, :2] / start.places[:, 2:] + PLACE * change[..., :2]
-    return Rig(
-        landmarks=start.landmarks + LANDMARK * landmarks,
-        rotations=matrices @ start.rotations,
-        places=np.concatenate([sideways * depth[..., None], depth[..., None]], axis=-1),
-        focal=evidence.focal * np.exp(np.clip(evidence.focal_std * focal, -5, 5)),
+@dataclasses.dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Of the residuals; see `moved` for the unknowns.
+
+    by_landmark: of `seen`, by their landmark. by_view: by turn, place and mean of their view. by_focal: by the y of its kind.
+    tied: (t, k, 3) of `tied`, by all landmarks. Those of `focal` by y are 1.
+    """
+
+    by_landmark: Float[np.ndarray, "c k 5 3"]
+    by_view: Float[np.ndarray, "c k 5 9"]
+    by_focal: Float[np.ndarray, "c k 5"]
+    tied: Float[np.ndarray, "t k 3"]
+
+
+def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
+    """Landmarks as the cameras see them, less those detected, pixels."""
+    seen = _turned(rig) + rig.places[:, None]
+    return rig.focal[:, None, None] * seen[..., :2] / np.maximum(seen[..., 2:], NEAR) - evidence.points
+
+
+def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
+    """Residuals with this robust scale."""
+    root, turned = np.sqrt(evidence.weights)[..., None], _turned(rig)
+    errors = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
+    errors = errors * scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True))
+    share = _shares(evidence)
+    centered = turned - np.sum(share * turned, axis=1, keepdims=True)
+    radius = lambda points: 0.5 * np.log(np.sum(share * points**2) + 1e-12)
+    size = (radius(centered) - radius(evidence.world)) / SIZE
+    lengths = np.linalg.norm(_bones(evidence, rig), axis=-1)
+    return Rows(
+        seen=np.concatenate([root * errors, root * (centered - evidence.world) / WORLD], axis=-1),
+        tied=np.append(size, (lengths[:, 0] - lengths[:, 1]) / BONES),
+        focal=_factors(evidence, rig),
     )
 
 
-def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "*n c k 2"]:
-    """Landmarks as the cameras see them, less those detected, pixels."""
-    return _pixel_errors(evidence, rig, _turned(rig))
+def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
+    """Of `residuals`, with the mean of a view as an unknown of its own, which does not change the minimum."""
+    root, turned = np.sqrt(evidence.weights)[..., None, None], _turned(rig)
+    c, k = evidence.weights.shape
+    by_turn = -_cross(turned)  # a small turn by w moves X by w x X
+
+    # d p / d place, for the changes of `moved`: sideways over the depth twice, and the logarithm of the depth
+    by_place = np.zeros((c, 3, 3))
+    by_place[:, 0, 0] = by_place[:, 1, 1] = rig.places[:, 2]
+    by_place[:, :, 2] = rig.places
+
+    # d e / d p of e = f (p_x, p_y) / p_z - x; a clamped depth is a constant
+    p = turned + rig.places[:, None]
+    depth = np.maximum(p[..., 2], NEAR)
+    by_point = np.zeros((c, k, 2, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
+    by_point[..., 2] = np.where(p[..., 2:] > NEAR, -p[..., :2] / depth[..., None] ** 2, 0.0)
+    by_point *= rig.focal[:, None, None, None]
+
+    # d rho / d q = s / sqrt(s^2 + |q|^2) (1 - q q^T / (s^2 + |q|^2))
+    q = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
+    square = (scale**2 + np.sum(q**2, axis=-1))[..., None, None]
+    by_error = root * scale / np.sqrt(square) * (np.eye(2) - q[..., :, None] * q[..., None, :] / square)
+    by_error /= evidence.noise[:, None, None, None]
+
+    pixels = by_error @ by_point
+    world = np.broadcast_to(root * np.eye(3) / WORLD, (c, k, 3, 3))
+    none = np.zeros((c, k, 2, 3))
+    zoom = evidence.focal_std[:, None, None] * (pixel_errors(evidence, rig) + evidence.points)
+    by_focal = np.concatenate([(by_error @ zoom[..., None])[..., 0], np.zeros((c, k, 3))], axis=-1)
+    by_own = np.concatenate([pixels, world], axis=2)
+    by_view = [by_own @ by_turn, np.concatenate([pixels @ by_place[:, None], 0 * world], 2), np.concatenate([none, -world], 2)]
+    return Derivatives(
+        by_landmark=by_own @ rig.rotations[:, None],
+        by_view=np.concatenate(by_view, axis=-1),
+        by_focal=by_focal,
+        tied=_tied(evidence, rig, turned),
+    )
 
 
-def _pixel_errors(evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "*n c k 3"]) -> Float[np.ndarray, "*n c k 2"]:
-    seen = turned + rig.places[..., None, :]
-    return seen[..., :2] / np.maximum(seen[..., 2:], NEAR) * rig.focal[..., None, None] - evidence.points
+def _tied(evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "c k 3"]) -> Float[np.ndarray, "t k 3"]:
+    """d log r / d L = the sum over views of share R^T (X - mean) / r^2, and of bones d |a - b| / d a = (a - b) / |a - b|."""
+    share = _shares(evidence)
+    centered = turned - np.sum(share * turned, axis=1, keepdims=True)
+    square = np.sum(share * centered**2) + 1e-12
+    size = np.sum((share * centered) @ rig.rotations, axis=0) / square / SIZE
+    bones = np.zeros((len(evidence.bones), *rig.landmarks.shape))
+    vectors = _bones(evidence, rig)
+    unit = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9) / BONES
+    rows = np.arange(len(bones))
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        bones[rows, evidence.bones[:, side, 0]] += sign * unit[:, side]
+        bones[rows, evidence.bones[:, side, 1]] -= sign * unit[:, side]
+    return np.concatenate([size[None], bones])
 
 
-def _turned(rig: Rig) -> Float[np.ndarray, "*n c k 3"]:
-    return rig.landmarks[..., None, :, :] @ np.swapaxes(rig.rotations, -1, -2)
+def _shares(evidence: Evidence) -> Float[np.ndarray, "c k 1"]:
+    return (evidence.weights / evidence.weights.sum(axis=1, keepdims=True))[..., None]
 
 
-def _residuals(evidence: Evidence, start: Rig, y: Float[np.ndarray, "n u"], scale: float) -> Float[np.ndarray, "n r"]:
-    rig = _moved(evidence, start, y)
-    turned, root = _turned(rig), np.sqrt(evidence.weights)[..., None]
-    errors = _pixel_errors(evidence, rig, turned) / evidence.noise[:, None, None]
-    errors = errors * (scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True)))  # as `state.robust`
-    share = evidence.weights / evidence.weights.sum(axis=1, keepdims=True)
-    centered = turned - np.sum(share[..., None] * turned, axis=-2, keepdims=True)
-    radius = lambda points: 0.5 * np.log(np.sum(share[..., None] * points**2, axis=(-2, -1)).sum(-1) + 1e-12)
-    bone = rig.landmarks[:, evidence.bones]
-    lengths = np.linalg.norm(bone[..., 0, :] - bone[..., 1, :], axis=-1)
-    k, c = evidence.weights.shape[1], len(evidence.noise)
-    parts = [
-        root * errors,
-        root * (centered - evidence.world) / WORLD,
-        (lengths[..., 0] - lengths[..., 1]) / BONES,
-        (radius(centered) - radius(evidence.world)) / SIZE,
-        y[:, -1],
-        # what no evidence tells: axes and origin of the landmarks
-        y[:, 3 * k : 3 * k + 3] / TURN,
-        y[:, : 3 * k].reshape(len(y), k, 3).mean(axis=1),
-        UNSEEN * y[:, : 3 * k + 6 * c],
-    ]
-    return np.concatenate([part.reshape(len(y), -1) for part in parts], axis=1)
+def _turned(rig: Rig) -> Float[np.ndarray, "c k 3"]:
+    return rig.landmarks @ np.swapaxes(rig.rotations, -1, -2)
+
+
+def _bones(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "b 2 3"]:
+    ends = rig.landmarks[evidence.bones]
+    return ends[:, :, 0] - ends[:, :, 1]
+
+
+def _factors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, " g"]:
+    """The y of each kind, from any camera of it."""
+    factors = np.zeros(1 + int(evidence.kinds.max()))
+    factors[evidence.kinds] = np.log(rig.focal / evidence.focal) / evidence.focal_std
+    return factors
+
+
+def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Matrices [x] with [x] y = x x y."""
+    out = np.zeros((*x.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+# Adjustment ----------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Step:
+    """A change of a rig. landmarks: (k, 3) metres. views: (c, 9): turn (radians), place (sideways over the depth, twice, and the
+    logarithm of the depth), and the mean of the view, which follows from the rest. focal: (g,) of the y of each kind.
+    """
+
+    landmarks: Float[np.ndarray, "k 3"]
+    views: Float[np.ndarray, "c 9"]
+    focal: Float[np.ndarray, " g"]
+
+
+def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
+    """A rig after a step."""
+    turns, sideways, deeper = step.views[:, :3], step.views[:, 3:5], np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST)
+    depth = rig.places[:, 2:] * np.exp(deeper)  # never behind the camera
+    factors = (_factors(evidence, rig) + step.focal)[evidence.kinds]
+    return Rig(
+        landmarks=rig.landmarks + step.landmarks,
+        rotations=Rotation.from_rotvec(turns).as_matrix() @ rig.rotations,
+        places=np.concatenate([(rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth, depth], axis=1),
+        focal=evidence.focal * np.exp(np.clip(evidence.focal_std * factors, -FURTHEST, FURTHEST)),
+    )
+
+
+def adjust(
+    evidence: Evidence, start: Rig, tolerance: float = EXACT, scales: Sequence[float] = ROBUST_SCALES
+) -> tuple[Rig, float]:
+    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the residuals.
+
+    Arguments: tolerance: relative decrease of the cost that ends the search. scales: robust ones, one search after the other.
+    """
+    rig, cost = start, np.inf
+    for scale in scales:
+        rig, cost = _descend(evidence, rig, scale, tolerance)
+    return rig, cost
+
+
+def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tuple[Rig, float]:
+    """With one robust scale. The damping follows Nielsen 1999, as Madsen, Nielsen and Tingleff 2004, algorithm 3.16."""
+    rows = residuals(evidence, rig, scale)
+    normal = normal_equations(evidence, rows, derivatives(evidence, rig, scale))
+    damping, growth = DAMPING, 2.0
+    for _ in range(STEPS):
+        step, expected = solve(normal, damping)
+        trial = moved(evidence, rig, step)
+        after = residuals(evidence, trial, scale)
+        gain = rows.cost - after.cost
+        if not gain > 0:  # nor where it is not finite
+            if not expected > tolerance * rows.cost or damping > 1e8:
+                break
+            damping, growth = damping * growth, 2 * growth
+            continue
+        done = gain < tolerance * rows.cost
+        rig, rows = trial, after
+        if done:
+            break
+        damping, growth = damping * max(1 / 3, 1 - (2 * gain / expected - 1) ** 3), 2.0
+        normal = normal_equations(evidence, rows, derivatives(evidence, rig, scale))
+    return rig, rows.cost
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """J^T J and J^T r in blocks, of `seen` and `focal`: landmarks (k, 3, 3), cameras (m, m) with m = 9 c + g, and between them.
+
+    tied: (t, k, 3) derivatives of the rows that tie landmarks, and their residuals (t,), which stay rows.
+    """
+
+    landmarks: Float[np.ndarray, "k 3 3"]
+    cameras: Float[np.ndarray, "m m"]
+    between: Float[np.ndarray, "k 3 m"]
+    by_landmarks: Float[np.ndarray, "k 3"]
+    by_cameras: Float[np.ndarray, " m"]
+    tied: Float[np.ndarray, "t k 3"]
+    tied_rows: Float[np.ndarray, " t"]
+    kinds: int
+
+
+def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalEquations:
+    """Of all residuals."""
+    c, k = evidence.weights.shape
+    g = len(rows.focal)
+    own = np.eye(g)[evidence.kinds]  # (c, g) 1 for the kind of a view
+    m = VIEW * c + g
+    landmark, view, focal = of.by_landmark, of.by_view, of.by_focal
+
+    # between landmarks and cameras
+    transposed = np.swapaxes(landmark, -1, -2)
+    between = np.zeros((k, 3, m))
+    between[..., : VIEW * c] = np.moveaxis(transposed @ view, 0, 2).reshape(k, 3, VIEW * c)
+    between[..., VIEW * c :] = np.einsum("cka,cg->kag", (transposed @ focal[..., None])[..., 0], own)
+
+    # between cameras: views among themselves, and with the kind of theirs
+    views = view.reshape(c, k * 5, VIEW)
+    zoom = focal.reshape(c, k * 5, 1)
+    turned = np.swapaxes(views, 1, 2)
+    cameras = np.zeros((m, m))
+    blocks = np.zeros((c, VIEW, c, VIEW))
+    blocks[np.arange(c), :, np.arange(c)] = turned @ views
+    cameras[: VIEW * c, : VIEW * c] = blocks.reshape(VIEW * c, VIEW * c)
+    cross = ((turned @ zoom) * own[:, None]).reshape(VIEW * c, g)
+    cameras[: VIEW * c, VIEW * c :], cameras[VIEW * c :, : VIEW * c] = cross, cross.T
+    cameras[VIEW * c :, VIEW * c :] = np.diag(own.T @ np.sum(zoom**2, axis=(1, 2)) + 1)
+
+    seen = rows.seen.reshape(c, k * 5, 1)
+    by_focal = own.T @ np.sum(zoom * seen, axis=(1, 2)) + rows.focal
+    return NormalEquations(
+        landmarks=np.sum(transposed @ landmark, axis=0),
+        cameras=cameras,
+        between=between,
+        by_landmarks=np.sum(transposed @ rows.seen[..., None], axis=0)[..., 0],
+        by_cameras=np.concatenate([(turned @ seen).ravel(), by_focal]),
+        tied=of.tied,
+        tied_rows=rows.tied,
+        kinds=g,
+    )
+
+
+def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
+    """The damped step of Gauss and Newton, and the decrease of the cost that it expects.
+
+    With l the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r as unknowns of their own:
+
+        D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
+        E^T l + C q       = -b
+        U l         - t   = -r
+
+    With F = (E, U^T) and K = diag(C, -1), l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1 F) (q, t) = F^T D^-1 a - (b, r).
+    """
+    k, ties, m = len(normal.landmarks), len(normal.tied_rows), len(normal.by_cameras)
+    diagonal = np.einsum("kaa->ka", normal.landmarks)
+    damped = damping * diagonal + STILL
+    damped_cameras = damping * np.diag(normal.cameras) + STILL
+    D = normal.landmarks + damped[..., None] * np.eye(3)
+    F = np.concatenate([normal.between, np.moveaxis(normal.tied, 0, 2)], axis=2)
+    K = np.zeros((m + ties, m + ties))
+    K[:m, :m] = normal.cameras + np.diag(damped_cameras)
+    K[m:, m:] = -np.eye(ties)
+
+    solved = np.linalg.solve(D, np.concatenate([F, normal.by_landmarks[..., None]], axis=2)).reshape(3 * k, -1)
+    F = F.reshape(3 * k, -1)
+    right = F.T @ solved[:, -1] - np.concatenate([normal.by_cameras, normal.tied_rows])
+    cameras = np.linalg.solve(K - F.T @ solved[:, :-1], right)
+    landmarks = -(solved[:, -1] + solved[:, :-1] @ cameras).reshape(k, 3)
+
+    q = cameras[:m]
+    a = normal.by_landmarks + np.einsum("tka,t->ka", normal.tied, normal.tied_rows)
+    expected = 0.5 * (np.sum(landmarks * (damped * landmarks - a)) + q @ (damped_cameras * q - normal.by_cameras))
+    views = VIEW * ((m - normal.kinds) // VIEW)
+    return Step(landmarks, q[:views].reshape(-1, VIEW), q[views:]), float(expected)

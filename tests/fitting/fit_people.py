@@ -16,7 +16,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, SurfacePoints
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, SIDES, Keypoints, mirrored_name
-from humangs_jax.fitting.person_cameras import PersonViews
+from humangs_jax.fitting.person_moments import PersonViews
 from humangs_jax.fitting.residuals.keypoints import make_observations
 from humangs_jax.fitting.state import MIRROR, pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
