@@ -35,6 +35,62 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
+# Names of the two sides ------------------------------------------------------------------------------------------------
+
+
+class _FacePart(NamedTuple):
+    """Points of the face, from `first` to before `end`. Two are mirror images if their numbers add up to `total`.
+
+    left_is_later: whether the one with the larger number is on the person's left.
+    """
+
+    first: int
+    end: int
+    total: int
+    left_is_later: bool = True
+
+
+_FACE_PARTS = (
+    _FacePart(0, 17, 16),  # jaw
+    _FacePart(17, 27, 43),  # brows
+    _FacePart(31, 36, 66),  # nostrils
+    _FacePart(48, 55, 102),  # upper lip, outside
+    _FacePart(55, 60, 114, left_is_later=False),  # lower lip, outside
+    _FacePart(60, 65, 124),  # upper lip, inside
+    _FacePart(65, 68, 132, left_is_later=False),  # lower lip, inside
+)
+_FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
+"""Of the right eye, and of the left."""
+
+
+def mirrored_name(name: str) -> str:
+    """Returns the landmark that a mirror puts in the place of `name`; what is in the middle is its own mirror image."""
+    kind, _, rest = name.partition("_")
+    if kind == "face":
+        return f"face_{_mirrored_face(int(rest))[0]}"
+    other = {"left": "right", "right": "left"}
+    return f"{other[kind]}_{rest}" if kind in other else name
+
+
+def side_of(name: str) -> int:
+    """Returns -1 for a landmark of the person's right, and 1 for the left and the middle."""
+    kind, _, rest = name.partition("_")
+    if kind == "face":
+        return _mirrored_face(int(rest))[1]
+    return -1 if kind == "right" else 1
+
+
+def _mirrored_face(i: int) -> tuple[int, int]:
+    """The number of the mirror image of a point of the face, and the side of the point."""
+    for first, end, total, left_is_later in _FACE_PARTS:
+        if first <= i < end:
+            right = i < total - i if left_is_later else i > total - i
+            return total - i, -1 if right else 1
+    if i in _FACE_EYES:
+        return _FACE_EYES[i], -1
+    return {left: right for right, left in _FACE_EYES.items()}.get(i, i), 1
+
+
 # Places of detectors --------------------------------------------------------------------------------------------------
 
 
@@ -180,7 +236,8 @@ def landmark_model(
         )
     vertices = sorted({source for found in sources for source in found if source >= 0})
     joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
-    kinds = sorted({kind_of(place.name) for place in placed})
+    pairs = [place.name if side_of(place.name) > 0 else mirrored_name(place.name) for place in placed]
+    numbers = sorted(set(pairs))
     regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
     for row, name, found in zip(regressor, names, sources, strict=True):
         for source in found:
@@ -200,7 +257,7 @@ def landmark_model(
         joint_names=body.joint_names,
         movers=_movers(body.parents, np.any(regressor[:, :joints], axis=0), np.asarray(points.weights)),
         placed=tuple(names.index(place.name) for place in placed),
-        groups=tuple((kinds.index(kind_of(each.name)), -1 if each.name.startswith("right_") else 1) for each in placed),
+        groups=tuple((numbers.index(pair), side_of(each.name)) for pair, each in zip(pairs, placed, strict=True)),
     )
 
 

@@ -7,11 +7,11 @@ import pytest
 from rounding import bound
 
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.body.landmarks import Place, landmark_model, pose_landmarks
+from humangs_jax.body.landmarks import Place, landmark_model, mirrored_name, pose_landmarks, side_of
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67, mirrored_name
+from humangs_jax.data.keypoints.keypoints import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67
 
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images
@@ -80,6 +80,32 @@ def test_left_and_right_are_mirror_images(body, whole):
             assert np.linalg.norm(point - points[mirrored_name(name)] * [-1, 1, 1]) < SYMMETRY, name
             side = {"left": 1, "right": -1}.get(name.split("_")[0], 0)
             assert side * point[0] > 0 or not side, name
+
+
+@pytest.mark.parametrize("kind", [MEDIAPIPE_33, COCO_17], ids=lambda kind: kind.name)
+def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
+    """Points of the face, too: the corners of the eyes and of the mouth are pairs."""
+    model = landmark_model(body, kind.names, kind.places)
+    groups = {model.names[row]: own for row, own in zip(model.placed, model.groups, strict=True)}
+    assert len({group for group, _ in groups.values()}) == len({frozenset((n, mirrored_name(n))) for n in groups})
+    offsets = np.random.default_rng(0).normal(0, 0.01, (len(groups), 3))
+    moved = dict(zip(model.names, model.by_landmark(jnp.asarray(offsets)), strict=True))
+    x = {name: at_rest(model)[i, 0] for i, name in enumerate(model.names)}
+    for name, (group, side) in groups.items():
+        assert groups[mirrored_name(name)][0] == group
+        if (other := mirrored_name(name)) != name:
+            np.testing.assert_allclose(moved[other], moved[name] * [-1, 1, 1], atol=1e-6)
+            assert side * x[name] > 0, name
+
+
+def test_the_sides_of_all_points_of_the_face():
+    """300-W counts jaw, brows, nostrils and upper lips from the person's right to the left, and lower lips back."""
+    left = {*range(9, 17), *range(22, 27), 34, 35, *range(42, 48), 52, 53, 54, 55, 56, 63, 64, 65}
+    middle = {8, *range(27, 31), 33, 51, 57, 62, 66}
+    names = [f"face_{i}" for i in range(68)]
+    assert {i for i in range(68) if mirrored_name(names[i]) == names[i]} == middle
+    assert {i for i in range(68) if side_of(names[i]) > 0} == left | middle
+    assert all(mirrored_name(mirrored_name(name)) == name for name in names)
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.body.landmarks import Place, both_sides, place, plain_places
+from humangs_jax.body.landmarks import Place, both_sides, mirrored_name, place, plain_places
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json, file_numbers
 from humangs_jax.data.formats import KEYPOINTS
@@ -44,10 +44,6 @@ _BODY_25 = (
     *("right_eye", "left_eye", "right_ear", "left_ear"),
     *_FEET,
 )
-_FACE_SUMS = ((0, 17, 16), (17, 27, 43), (31, 36, 66), (48, 55, 102), (55, 60, 114), (60, 65, 124), (65, 68, 132))
-"""(first, end, sum): landmarks i and sum - i are mirror images: jaw, brows, nostrils, upper and lower lip, outside and
-inside."""
-_FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,22 +77,6 @@ class KeypointSet:
 def hand_names(side: str) -> tuple[str, ...]:
     """The 21 points of one hand, in the order of OpenPose and COCO-WholeBody."""
     return (f"{side}_hand_root", *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS))
-
-
-def mirrored_name(name: str) -> str:
-    """The point that a mirror puts in the place of `name`."""
-    kind, _, rest = name.partition("_")
-    if kind == "face":
-        return f"face_{_mirrored_face(int(rest))}"
-    other = {"left": "right", "right": "left"}
-    return f"{other[kind]}_{rest}" if kind in other else name
-
-
-def _mirrored_face(i: int) -> int:
-    for first, end, total in _FACE_SUMS:
-        if first <= i < end:
-            return total - i
-    return (_FACE_EYES | {b: a for a, b in _FACE_EYES.items()}).get(i, i)
 
 
 def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
