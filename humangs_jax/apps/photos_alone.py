@@ -19,12 +19,13 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
 from humangs_jax.data.calibration.photos import upright_mask
+from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.photos import read_description
 from humangs_jax.fitting.person_cameras import PersonCameras, cameras_from_person
 from humangs_jax.fitting.person_moments import PersonViews
-from humangs_jax.io.images import DIAGONAL_35MM, focal_length, image_size, resized, write_png
+from humangs_jax.io.images import DIAGONAL_35MM, cropped_from, focal_length, image_size, resized, write_png
 
 LONGEST, LEAST_PERSON = 2048, 700
 """Pixels: longest side to which photos are reduced, and size of the person there below which they stay as they are."""
@@ -93,12 +94,13 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
 
 
 class _Looked(NamedTuple):
-    """photos: all of them. shown: those with the person `number`. seen: of these."""
+    """photos: all of them. shown: those with the person `number`. seen: of these. cropped: a line for photos that were cut."""
 
     photos: list[PhotoPeople]
     number: int
     shown: list[int]
     seen: PersonViews
+    cropped: tuple[str, ...]
 
 
 class _Choice(NamedTuple):
@@ -127,7 +129,20 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
         focal=np.asarray(focal),
         photos=tuple(names[i] for i in shown),
     )
-    return _Looked(photos, number, shown, seen)
+    return _Looked(photos, number, shown, seen, _cropped([files[i] for i in shown]))
+
+
+def _cropped(files: list[Path]) -> tuple[str, ...]:
+    """A warning that names the photos whose EXIF describes a larger frame."""
+    found = [(file, frame) for file in files if (frame := cropped_from(file)) is not None]
+    if not found:
+        return ()
+    named = [f"{file.name} ({_by(image_size(file))}, EXIF {_by(frame)})" for file, frame in found]
+    return (f"cropped, as their shape is not that of their EXIF: {few(named)}: their focal length is taken for unknown",)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
 
 
 def _chosen(photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice) -> tuple[list[PhotoPeople], int]:
@@ -154,7 +169,7 @@ def _written(
     own_masks: bool,
     also: Mapping[str, object] | None,
 ) -> PhotosImported:
-    photos, number, shown, seen = looked
+    photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
     report = import_calibration(_calibration(seen, found, images), images, out, masks=masks, also=also)
     views = read_description(out / "capture.json")["views"]
@@ -166,7 +181,7 @@ def _written(
         name, size = f"{Path(described['image']).stem}.png", (report.width, report.height)  # padded
         written.append(dataclasses.replace(photo, people=tuple(people), name=name, size=size))
     detect.write_found(out, written, number, masks=own_masks, to_capture=True)
-    warnings = (*found.warnings, *report.warnings)
+    warnings = (*cropped, *found.warnings, *report.warnings)
     return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(written))
 
 

@@ -39,6 +39,10 @@ GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
 ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
+FRAME_TAGS = (0xA002, 0xA003)
+"""EXIF's width and height of the photo as it was taken."""
+SAME_SHAPE = 0.01
+"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel, by rounding."""
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
 EXIF_MARKS = (b"Exif", b"eXIf", b"EXIF", b"ftypavi", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
@@ -139,13 +143,46 @@ def orientation(path: str | Path) -> int:
 def focal_length(path: str | Path) -> float | None:
     """Focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the photo; None where that is missing or 0.
 
-    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. The photo must not be cropped. Raises: as `open_image`.
+    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out of what EXIF describes,
+    see `cropped_from`, it is not known. Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
-        equivalent = _exif(image, data, EXIF_TAGS).get(FOCAL_LENGTH_35MM_TAG)
-        if not isinstance(equivalent, int) or equivalent <= 0:
+        tags = _exif(image, data, EXIF_TAGS)
+        equivalent = tags.get(FOCAL_LENGTH_35MM_TAG)
+        if not isinstance(equivalent, int) or equivalent <= 0 or _other_frame(tags, image.size) is not None:
             return None
         return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
+
+
+def cropped_from(path: str | Path) -> tuple[int, int] | None:
+    """Width and height that EXIF says if the photo has another shape: it was cut out of that. Else None.
+
+    Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
+    """
+    with open_image(path) as (image, data):
+        return _other_frame(_exif(image, data, EXIF_TAGS), image.size)
+
+
+def _other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
+    width, height = (tags.get(tag) for tag in FRAME_TAGS)
+    if not isinstance(width, int) or not isinstance(height, int):
+        return None
+    frame, turned = (width, height), (height, width)
+    if not 0 < min(frame) <= max(frame) < LARGEST_SIDE or _same_shape(size, frame):
+        return None
+    # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
+    cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
+    return None if _same_shape(size, turned) and not cut_upright else frame
+
+
+LARGEST_SIDE = 1 << 24
+"""Pixels; sensors have less."""
+
+
+def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
+    scale = np.hypot(*size) / np.hypot(*frame)
+    off = np.abs(scale * np.asarray(frame) - size)
+    return bool((off <= 1 + SAME_SHAPE * np.asarray(size)).all())
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:

@@ -13,6 +13,7 @@ from PIL import Image
 
 from humangs_jax.io.images import (
     FORMATS,
+    cropped_from,
     focal_length,
     image_size,
     is_heic,
@@ -88,6 +89,37 @@ def test_focal_length_is_that_of_the_diagonal(kind, value, expected, tmp_path):
         exif.get_ifd(0x8769)[0xA405] = value
     Image.new("RGB", (30, 40)).save(tmp_path / "a", kind, exif=exif)
     assert focal_length(tmp_path / "a") == pytest.approx(expected)
+
+
+def with_frame(path, size, frame, flag=1):
+    """A photo of 26 mm whose EXIF says that it was taken with this width and height."""
+    exif = Image.Exif()
+    exif[0x0112] = flag
+    exif.get_ifd(0x8769).update({0xA405: 26, 0xA002: frame[0], 0xA003: frame[1]})
+    Image.new("RGB", size).save(path, "JPEG", exif=exif)
+    return path
+
+
+FRAME = (403, 302)
+
+
+@pytest.mark.parametrize("flag", [1, 6])
+@pytest.mark.parametrize("size", [FRAME, (202, 151), (101, 76), (67, 50), (806, 604), FRAME[::-1], (151, 202), (50, 67)])
+def test_photos_that_were_made_smaller_or_turned_have_a_focal_length(size, flag, tmp_path):
+    path = with_frame(tmp_path / "a.jpg", size, FRAME, flag)
+    assert focal_length(path) == pytest.approx(26 * np.hypot(*size) / 43.27) and cropped_from(path) is None
+
+
+@pytest.mark.parametrize("size", [(40, 60), (300, 300), (403, 227), (226, 302), (403, 100), (200, 302), (160, 90), (90, 160)])
+def test_photos_that_were_cropped_have_none(size, tmp_path):
+    path = with_frame(tmp_path / "a.jpg", size, FRAME)
+    assert focal_length(path) is None and cropped_from(path) == FRAME
+
+
+@pytest.mark.parametrize("frame", [(0, 0), (0, 40), (1 << 31, 1 << 31), ((1, 2), 3), ("40", "30")])
+def test_frames_of_nonsense_are_as_none(frame, tmp_path):
+    path = with_frame(tmp_path / "a.jpg", (30, 40), frame)
+    assert focal_length(path) == pytest.approx(26 * 50 / 43.27) and cropped_from(path) is None
 
 
 @pytest.mark.filterwarnings("ignore:Corrupt EXIF")
