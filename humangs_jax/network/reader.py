@@ -74,7 +74,7 @@ class PixelAlignedReader(Reader):
         indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), grid)
         read = sample_bilinear if self.output_width is None else sample_neighborhoods
         counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
-        mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts)
+        mean = lambda sums: jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
         local = jax.tree.map(mean, sum_over_views(read, maps, indices, weights))
         if self.output_width is not None:
             kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, maps.shape[-1], self.output_width))
@@ -162,8 +162,8 @@ def photo_colors(
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
     counts = jnp.sum(visible, axis=0)[:, None]
-    mean = jnp.einsum("vnc,vn->nc", colors, visible.astype(colors.dtype)) / jnp.maximum(counts, 1)
-    return jnp.where(counts > 0, mean, UNSEEN_COLOR)
+    sums = jnp.einsum("vnc,vn->nc", colors, visible.astype(colors.dtype), precision=transform.EXACT)
+    return jnp.where(counts > 0, sums / jnp.maximum(counts, 1), UNSEEN_COLOR)
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
@@ -209,7 +209,8 @@ def sample_shells(
     colors, masks, weights, framed = jax.vmap(view)(images, foreground, depth_maps, cameras, vertices, normals)
     framed, weights = framed & present[:, None], weights * present[:, None]
     total = jnp.sum(weights * masks, axis=0)
-    mean = jnp.einsum("vpc,vp->pc", colors, weights) / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
+    sums = jnp.einsum("vpc,vp->pc", colors, weights, precision=transform.EXACT)
+    mean = sums / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
     known = jnp.sum(framed, axis=0)
     inside = jnp.where(known > 0, jnp.sum(masks * framed, axis=0) / jnp.maximum(known, 1), 1)
     by_vertex = lambda x: x.reshape(count, len(distances), *x.shape[1:])

@@ -84,10 +84,11 @@ def _reference(gaussians: Gaussians, camera: Camera, background: Array, config: 
     colors = gaussians.colors
     if gaussians.harmonics is not None:
         sight = jnp.where(visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0)
-        sight = sight @ camera.cam_from_world[:3, :3]
+        sight = jnp.matmul(sight, camera.cam_from_world[:3, :3], precision=transform.EXACT)
         sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
         functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
-        colors = jnp.maximum(colors + jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics), 0)
+        added = jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics, precision=transform.EXACT)
+        colors = jnp.maximum(colors + added, 0)
     if features is not None:
         colors = jnp.concatenate([colors, features], axis=-1)
     state = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype), blank, blank + 1, blank > 0
