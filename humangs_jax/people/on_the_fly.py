@@ -32,7 +32,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.people import surroundings
 from humangs_jax.people.anatomy import MIRROR
 from humangs_jax.people.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleBank
-from humangs_jax.people.subject import SPLITS, SUPERSAMPLING, subject_key
+from humangs_jax.people.subject import APPEARANCES, SPLITS, SUPERSAMPLING, subject_key
 from humangs_jax.people.surroundings import pick
 from humangs_jax.rendering.mesh.rasterizer import Fragments, rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
@@ -104,11 +104,18 @@ class Scene:
     lights: surroundings.Lights
 
 
-def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
-    """Views of a person of the bank: inputs and targets. Raises: ValueError for a `displaced_share` of a bank that has none."""
+def on_the_fly_example(
+    bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: Int[Array, ""] | int | None = None
+) -> Example:
+    """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the key chooses.
+
+    Raises: ValueError for a `displaced_share` of a bank that has none.
+    """
     if config.displaced_share and not bank.displacements.shape[1]:
         raise ValueError("displaced_share: the bank has no displacements: expected one of build_bank(displaced=body)")
     numbers = _draw_numbers(bank, key, config)
+    if person is not None:
+        numbers["person"] = jnp.asarray(person + 0.5) / bank.people  # which `pick` takes for this one
     scene = scene_from(numbers, bank)
     count = None
     if config.view_counts:
@@ -334,6 +341,7 @@ class GeneratedSource:
 
     make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see `ViewSampling`.
     on_host: bring the arrays to the host, where they mix with those of files and are divided among devices.
+    person_of: called as person_of(key, input_count), gives the seed of the person whom `make` shows; None: that of the key.
 
     Raises: ValueError if there is no such split.
     """
@@ -342,6 +350,7 @@ class GeneratedSource:
     split: str = "train"
     input_counts: tuple[int, ...] = (4,)
     on_host: bool = False
+    person_of: Callable[[Key, int], int] | None = None
 
     def __post_init__(self):
         if self.split not in SPLITS:
@@ -365,7 +374,10 @@ class GeneratedSource:
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
         """See `Source`."""
-        return f"synthetic person {self._person(seed, index)} in appearance {index}"
+        person = self._person(seed, index)
+        if self.person_of is not None:
+            person = self.person_of(self.drawn_key(seed, index), input_count)
+        return _described(person, index)
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
         """See `Source`."""
@@ -373,9 +385,44 @@ class GeneratedSource:
         return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
 
 
-def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
+def _described(person: int, appearance: int) -> str:
+    return f"synthetic person {person} in appearance {appearance}"
+
+
+@dataclasses.dataclass(frozen=True)
+class EachPerson:
+    """Each person of a bank once, in order: people to compare on. input_counts, on_host: see `GeneratedSource`."""
+
+    bank: PeopleBank
+    config: OnTheFlyConfig
+    input_counts: tuple[int, ...] = (4,)
+    on_host: bool = False
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """Empty: there are no files."""
+        return {}
+
+    def __len__(self) -> int:
+        return self.bank.people
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        return _described(int(self.bank.seeds[index % self.bank.people]), index)
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """See `Source`. Who it is depends on the index alone, how they look on both."""
+        person = index % self.bank.people
+        appearance = int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(APPEARANCES))
+        key = subject_key(int(self.bank.seeds[person]), appearance)
+        config = dataclasses.replace(self.config, input_views=input_count)
+        example = jitted_example(self.bank, key, config=config, person=person)
+        return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+
+def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None) -> Example:
     """`on_the_fly_example`, compiled once per configuration and shape of the bank; with `CPU_COMPILER_OPTIONS` on a CPU."""
-    return _compiled()(bank, key, config=config)
+    return _compiled()(bank, key, config=config, person=person)
 
 
 @functools.cache
@@ -383,12 +430,30 @@ def _compiled() -> Callable[..., Example]:
     return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=compiler_options())
 
 
+def person_drawn(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> int:
+    """The seed of the person of a bank whom `on_the_fly_example` shows."""
+    number = _draw_numbers(bank, key, config)["person"]
+    return int(bank.seeds[pick(number, bank.people)])
+
+
 def on_the_fly_source(
-    bank: PeopleBank, config: OnTheFlyConfig, input_counts: tuple[int, ...] = (4,), on_host: bool = False
-) -> GeneratedSource:
-    """Examples of a bank for `loader.Loader` and `loader.Mixture`: all of people of the bank's split.
+    bank: PeopleBank,
+    config: OnTheFlyConfig,
+    input_counts: tuple[int, ...] = (4,),
+    on_host: bool = False,
+    each_once: bool = False,
+) -> GeneratedSource | EachPerson:
+    """Examples of a bank for `Loader` and `Mixture`: random people of it, or each of them once, in order.
 
     input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
     """
-    make = lambda key, count: jitted_example(bank, key, config=dataclasses.replace(config, input_views=count))
-    return GeneratedSource(make=make, split=bank.split, input_counts=input_counts, on_host=on_host)
+    if each_once:
+        return EachPerson(bank, config, input_counts, on_host)
+    drawn = lambda count: dataclasses.replace(config, input_views=count)
+    return GeneratedSource(
+        make=lambda key, count: jitted_example(bank, key, config=drawn(count)),
+        split=bank.split,
+        input_counts=input_counts,
+        on_host=on_host,
+        person_of=lambda key, count: person_drawn(bank, key, drawn(count)),
+    )

@@ -1,14 +1,21 @@
-"""Variants of a training run against the run itself: the same people, steps and seeds, differences with intervals."""
+"""Variants of a training run against the run itself: the same people, steps and seeds, differences with intervals.
+
+All of them are compared on the same people, photos and targets, those that the base is validated on, whatever a variant changes.
+"""
 
 import dataclasses
+import functools
 import importlib
 import json
+import math
 import re
 import time
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.stats import t as student
 
@@ -19,12 +26,19 @@ from humangs_jax.core.progress import bar, say, text_table
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.people.bank import build_bank
 from humangs_jax.people.subject import seeds_of
-from humangs_jax.training.config import TrainConfig, fitting_losses, read_config
-from humangs_jax.training.loop import train
-from humangs_jax.training.sources import MakeSource, on_the_fly_people
+from humangs_jax.training.config import TrainConfig, fitting_losses, missing_networks, read_config
+from humangs_jax.training.forward import METRICS, compared_as
+from humangs_jax.training.loop import VALIDATED, train
+from humangs_jax.training.sources import MakeSource, captured_people, on_the_fly_people
+from humangs_jax.training.state import init_state
 
 BASE = "base"
 CONFIDENCE = 0.95
+DEFAULT_METRIC = "psnr_fg"
+MARGIN = 0.1
+"""Share of the time of runs that a budget is proposed with beyond it."""
+LONGEST_NAME = 100
+"""Characters of a variant's name in the name of a folder; file systems allow 255 bytes."""
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 People = int | Sequence[str | Path] | MakeSource
 
@@ -46,11 +60,14 @@ class AblationRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """What `ablate` found. scores: of each variant, `metric` by seed. missing: runs that the budget had no room for."""
+    """What `ablate` found. scores: of each variant, `metric` by seed. missing: runs that the budget had no room for.
+    longest: seconds of the longest run, those of the base and of each variant compile a program of their own.
+    """
 
     metric: str
     scores: dict[str, dict[int, float]]
     missing: int = 0
+    longest: float = 0.0
 
     @property
     def rows(self) -> list[AblationRow]:
@@ -63,16 +80,31 @@ class Ablation:
         cells = [
             [row.name, str(row.seeds), f"{row.mean:.2f}", *(_shown(row) if row.name != BASE else ("", ""))] for row in self.rows
         ]
-        missing = [f"{self.missing} runs are missing: the budget was used up"] if self.missing else []
-        return "\n".join([*text_table([head, *cells]), *missing])
+        return "\n".join([*text_table([head, *cells]), *self._missing_told()])
+
+    def _missing_told(self) -> list[str]:
+        """What is missing, and the budget with which the same call would make it."""
+        if not self.missing:
+            return []
+        told = [f"{self.missing} runs are missing: the budget was used up"]
+        if self.longest:
+            enough = _as_budget(self.missing * self.longest * (1 + MARGIN))
+            took = f"a run took up to {_as_budget(self.longest)}"
+            told.insert(0, f'{took}: the same call goes on, budget="{enough}" would do for the rest')
+        return told
 
     def plot(self) -> Any:
-        """Differences to the base with their intervals; gray where the interval contains 0.
+        """Differences to the base with their intervals; gray where the interval contains 0. Without a difference it says so.
 
         Raises: ImportError without matplotlib, which the extra `notebooks` installs.
         """
         rows = [row for row in self.rows if row.name != BASE][::-1]
         make = importlib.import_module("matplotlib.figure").Figure
+        if not rows:
+            figure = make(figsize=(6.4, 1.0), dpi=150)
+            words = "\n".join(["no variant finished: there is nothing to compare", *self._missing_told()])
+            figure.text(0.5, 0.5, words, ha="center", va="center", fontsize="small")
+            return figure
         figure = make(figsize=(6.4, 1.0 + 0.35 * len(rows)), dpi=150, layout="constrained")
         axis = figure.add_subplot()
         for place, row in enumerate(rows):
@@ -93,7 +125,7 @@ def ablate(
     people: People = 16,
     validation: People = 4,
     out: str | Path = "ablation",
-    metric: str = "psnr_fg",
+    metric: str = DEFAULT_METRIC,
     body: BodyModel | None = None,
     networks: LossNetworks = NO_NETWORKS,
     progress: bool = True,
@@ -108,57 +140,116 @@ def ablate(
         variants: fields that change, by their paths (`vary`), of each variant by its name.
         seeds: runs of each variant.
         budget: wall-clock time, such as "90s", "5min" or "2h": no run begins that would probably end after it. The first one,
-            which compiles, may exceed it. None: all runs.
+            which compiles, may exceed it. The result says which budget would do for what is missing. None: all runs.
         people: to train on: a number of synthetic people, who are rendered during training; capture folders; or a source.
-        validation: other people to compare on, likewise.
+        validation: other people to compare on, likewise. Of a number and of folders each is looked at once, of a source the
+            first eight. Photos and targets are those of the base for all variants.
         out: folder of the runs.
         metric: of validation: "psnr", "psnr_fg", "ssim" and so on.
         body: that the people's parameters belong to. None: the shipped one.
-        networks: of losses that need them; those without are replaced (`fitting_losses`).
+        networks: of losses that need them; those of the base without one are replaced (`fitting_losses`).
         progress: show a bar.
 
     Returns:
         Rows with means, differences to the base and intervals; `print` and `.plot()` show them.
 
     Raises:
-        ValueError: for a variant named "base", a path that is no field, a budget or a number of seeds that cannot be meant, or a
-            folder with runs of other settings.
+        ValueError: before the first run, for a variant that cannot be trained: named "base", with a path that is no field, a
+            seed of its own, or a loss whose network is missing; for a metric, budget or number of seeds that cannot be meant.
+            Later, for a folder with runs of other settings.
         TrainingInterrupted: after Ctrl-C; what is trained is kept.
 
     Examples:
         >>> result = hg.ablate("tiny", {"no class token": {"model.architecture.encoder.transformer.class_token": False}})
         >>> result.plot()
     """
-    if BASE in variants:
-        raise ArgumentError("variants", f"{BASE!r}: is the name of the run that variants are compared with")
     if seeds < 1:
         raise ArgumentError("seeds", f"{seeds}: expected at least 1")
     seconds = _seconds(budget)
+    _check_metric(metric, networks)
     base = fitting_losses(read_config(base) if isinstance(base, str) else base, networks)
     # what is compared is the end of a run
     base = dataclasses.replace(base, validate_every=base.steps, checkpoint_every=base.steps)
-    runs = {name: vary(base, changes) for name, changes in {BASE: {}, **variants}.items()}
+    runs = {BASE: base, **_checked_variants(base, variants, networks)}
+    folders = {name: Path(out) / folder for name, folder in _folder_names(list(runs)).items()}
     body = load_body() if body is None else body
-    learned, compared = _source(people, body, base, "train"), _source(validation, body, base, "validation")
+    learned = _source(people, body, base, "train")
+    compared, count = _compared(validation, body, base)
     scores: dict[str, dict[int, float]] = {name: {} for name in runs}
     began, longest = time.monotonic(), 0.0
     order = [(name, seed) for seed in range(seeds) for name in runs]
     for name, seed in bar(order, desc="ablate", unit="run", shown=progress):
-        folder = Path(out) / re.sub(r"[^\w.+-]+", "_", name) / str(seed)
+        folder, config = folders[name] / str(seed), dataclasses.replace(runs[name], seed=seed)
         start = time.monotonic()
-        if seconds is not None and not _validated(folder, base.steps) and start - began + longest > seconds:
+        if seconds is not None and not _validated(folder, config.steps) and start - began + longest > seconds:
             continue
-        config = dataclasses.replace(runs[name], seed=seed)
-        train(config, body, learned, folder, validation=compared, networks=networks, progress=progress)
+        others = functools.partial(train, validation=compared, validated=count, networks=networks)
+        others(config, body, learned, folder, progress=progress)
         found = _validated(folder, config.steps)
         if metric not in found:
-            raise ArgumentError("metric", f"{metric!r}: is none of validation: {', '.join(sorted(found))}")
+            raise ArgumentError("validation", f"{validation!r}: nobody was looked at: expected people to compare on")
         scores[name][seed] = found[metric]
         longest = max(longest, time.monotonic() - start)
-    result = Ablation(metric, scores, sum(seeds - len(own) for own in scores.values()))
+    result = Ablation(metric, scores, sum(seeds - len(own) for own in scores.values()), longest)
     if progress:
         say(str(result))
     return result
+
+
+def _check_metric(metric: str, networks: LossNetworks) -> None:
+    """Raises: ArgumentError for one that validation does not find."""
+    known = METRICS if networks.lpips is None else (*METRICS, "lpips")
+    if metric not in known:
+        usual_first = sorted(known, key=lambda name: (name != DEFAULT_METRIC, name))
+        raise ArgumentError("metric", f"{metric!r}: is none of validation: {', '.join(usual_first)}")
+
+
+def _checked_variants(
+    base: TrainConfig, variants: Mapping[str, Mapping[str, Any]], networks: LossNetworks
+) -> dict[str, TrainConfig]:
+    """The runs of the variants. Raises: ValueError naming the variant that cannot be trained."""
+    runs = {}
+    for name, changes in variants.items():
+        if name == BASE:
+            raise ArgumentError("variants", f"{BASE!r}: is the name of the run that variants are compared with")
+        if "seed" in changes:
+            raise ArgumentError("variants", f"{name!r}: seed: all variants have the seeds 0, 1, ... of `seeds`")
+        try:
+            runs[name] = run = vary(base, changes)
+            jax.eval_shape(lambda run=run: init_state(run, None))  # whether its network can be made
+        except (TypeError, ValueError, ZeroDivisionError) as error:
+            said = (str(error).splitlines() or [type(error).__name__])[0]
+            raise ArgumentError("variants", f"{name!r}: {said}") from error
+        if missing := missing_networks(run, networks):
+            raise ArgumentError("variants", f"{name!r}: loss.{missing[0]}: expected its network in networks")
+    return runs
+
+
+def _folder_names(names: Sequence[str]) -> dict[str, str]:
+    """A folder for each variant: its name without signs that file systems dislike, and a checksum where that is no name of its
+    own, not even for file systems that do not tell upper from lower case.
+    """
+    plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
+    unusable = [name for name in names if not re.search(r"\w", plain[name]) or len(plain[name]) > LONGEST_NAME]
+    taken, folders = set[str](), {}
+    for name in sorted(names, key=lambda name: (name != BASE, plain[name] != name)):  # exact names keep theirs
+        folder = plain[name]
+        if name in unusable or folder.lower() in taken:
+            folder = f"{folder.strip('.')[:LONGEST_NAME]}-{zlib.crc32(name.encode()):08x}"
+        taken.add(folder.lower())
+        folders[name] = folder
+    return folders
+
+
+def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[MakeSource, int]:
+    """Whom all runs are compared on, and how many of them are looked at."""
+    found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
+    if isinstance(validation, int):
+        count = validation
+    if not isinstance(found, Sequence):
+        return compared_as(base, found), count
+    captured = functools.cache(lambda: captured_people(found, body))  # photos that are decoded once serve all runs
+    return compared_as(base, lambda config: captured()(config)), len(found)
 
 
 def _row(name: str, own: Mapping[int, float], base: Mapping[int, float]) -> AblationRow:
@@ -184,11 +275,20 @@ def _seconds(budget: str | None) -> float | None:
     return float(match[1]) * UNITS[match[2]]
 
 
-def _source(people: People, body: BodyModel, config: TrainConfig, split: str) -> Sequence[str | Path] | MakeSource:
+def _as_budget(seconds: float) -> str:
+    """A time, rounded up, as a budget is written."""
+    unit = "s" if seconds < 90 else "min" if seconds < 5400 else "h"
+    return f"{math.ceil(seconds / UNITS[unit])}{unit}"
+
+
+def _source(
+    people: People, body: BodyModel, config: TrainConfig, split: str, each_once: bool = False
+) -> Sequence[str | Path] | MakeSource:
     if not isinstance(people, int):
         return people
     texture = 128 if config.target_size <= 64 else 512 if config.target_size <= 256 else 1024
-    return on_the_fly_people(build_bank(seeds_of(split, 0, people), body, split, texture_size=texture))
+    bank = build_bank(seeds_of(split, 0, people), body, split, texture_size=texture)
+    return on_the_fly_people(bank, each_once=each_once)
 
 
 def _validated(folder: Path, step: int) -> dict[str, float]:

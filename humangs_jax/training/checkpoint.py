@@ -13,6 +13,7 @@ import contextlib
 import dataclasses
 import json
 import logging
+import math
 import operator
 import zlib
 from collections.abc import Generator
@@ -70,9 +71,10 @@ class Checkpoints:
         return self._manager.best_step()
 
     def score(self, step: int) -> float | None:
-        """The score that a checkpoint was saved with."""
+        """The score that a checkpoint was saved with; None without one, or for NaN, to which no score compares."""
         metrics = self._manager.metrics(step)
-        return None if metrics is None or metrics["score"] == UNSCORED else metrics["score"]
+        unscored = metrics is None or metrics["score"] == UNSCORED or math.isnan(metrics["score"])
+        return None if unscored else metrics["score"]
 
     def save(self, state: TrainState, score: float | None = None) -> None:
         """Write the state under its step, in the background: see `wait`. The state may be donated afterwards.
@@ -84,7 +86,8 @@ class Checkpoints:
             return
         if jax.default_backend() == "cpu":  # where the next step would overwrite the memory that is being written
             state = jax.tree.map(jnp.copy, state)
-        metrics = {"score": UNSCORED if score is None else float(score), CHECKSUM: _checksum(state)}
+        scored = score is not None and not math.isnan(score)
+        metrics = {"score": float(score) if scored else UNSCORED, CHECKSUM: _checksum(state)}
         with self._writing():
             self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
 

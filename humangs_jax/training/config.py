@@ -218,13 +218,18 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     return read_configuration(TrainConfig, path)
 
 
+def missing_networks(config: TrainConfig, networks: LossNetworks) -> list[str]:
+    """The losses of a run whose networks are missing."""
+    needing = ("perceptual", "vgg16", "lpips")
+    return [name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None]
+
+
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
     """The run without the losses whose networks are missing; a warning names them.
 
     Structural dissimilarity takes their place: its weight becomes at least that of `LossConfig()`.
     """
-    needing = ("perceptual", "vgg16", "lpips")
-    missing = [name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None]
+    missing = missing_networks(config, networks)
     if not missing:
         return config
     structural = max(config.loss.structural, LossConfig().structural)

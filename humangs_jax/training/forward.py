@@ -6,6 +6,7 @@ processes share the people; every process ends up with the means over all of the
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 
 import jax
@@ -18,7 +19,7 @@ from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loading import Example, ViewSampling
+from humangs_jax.data.loading import Example, Source, ViewSampling
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.losses.losses import masked_psnr, psnr, ray_spread, semi_transparent, similarity_map
@@ -55,12 +56,13 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """The network with the token capacity of a step with that number of photos.
 
     The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share plus that of one view,
-    because one photo may show more of a person than the others.
+    because one photo may show more of a person than the others. More photos, as in a comparison, get more in proportion.
     """
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
-    if views >= most:
+    if views == most:
         return config.model
-    return config.model.with_runtime(token_capacity=-(-capacity * (views + 1) // (most + 1)))
+    share = (views + 1) / (most + 1) if views < most else views / most
+    return config.model.with_runtime(token_capacity=math.ceil(capacity * share))
 
 
 def draw_targets(
@@ -133,8 +135,15 @@ METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "ove
 
 
 def validation_examples(make_source: MakeSource, config: TrainConfig, count: int) -> list[Example]:
-    """This process's examples of the first `count` subjects: inputs evenly spaced and of one pose, as many as in the
-    middle one of the training's counts; targets as large as the inputs.
+    """This process's examples of the first `count` subjects, see `as_validated`."""
+    source = make_source(as_validated(config))
+    own = range(jax.process_index(), min(count, len(source)), jax.process_count())
+    return [jax.tree.map(jnp.asarray, source.example(0, i, source.input_counts[0])) for i in own]
+
+
+def as_validated(config: TrainConfig) -> TrainConfig:
+    """The run with the views that it is validated on: inputs evenly spaced and of one pose, as many as in the middle one of the
+    training's counts; targets as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(
@@ -145,10 +154,19 @@ def validation_examples(make_source: MakeSource, config: TrainConfig, count: int
         mixed_pose_share=0.0,
     )
     without = dataclasses.replace(config.loss, depth=0.0)  # no loss is computed, so no depths are needed
-    size = config.model.conventions.image_size
-    source = make_source(dataclasses.replace(config, views=views, loss=without, target_size=size))
-    own = range(jax.process_index(), min(count, len(source)), jax.process_count())
-    return [jax.tree.map(jnp.asarray, source.example(0, i, views.input_counts[0])) for i in own]
+    return dataclasses.replace(config, views=views, loss=without, target_size=config.model.conventions.image_size)
+
+
+def compared_as(base: TrainConfig, make_source: MakeSource) -> MakeSource:
+    """The people with the photos and targets that a run is validated on, for variants of it: only the size of the photos, which a
+    network is made for, is the variant's.
+    """
+    own = as_validated(base.at(base.steps - 1))
+
+    def make(config: TrainConfig) -> Source:
+        return make_source(dataclasses.replace(config, views=own.views, target_size=own.target_size))
+
+    return make
 
 
 @functools.partial(jax.jit, static_argnames="config")

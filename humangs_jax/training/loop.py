@@ -209,7 +209,7 @@ def _tensorboard(folder: Path, step: int) -> Any:
 
 
 VALIDATED = 8
-"""Subjects that a validation looks at."""
+"""Subjects that a validation looks at, without another number."""
 SHOWN = 4
 """Validation subjects on the sheet."""
 DROPPED = {
@@ -238,6 +238,7 @@ def train(
     out: str | Path,
     *,
     validation: Sequence[str | Path] | MakeSource = (),
+    validated: int = VALIDATED,
     variables: Variables | None = None,
     networks: LossNetworks = NO_NETWORKS,
     fsdp: int | None = None,
@@ -254,6 +255,7 @@ def train(
         training: capture folders, or what makes another source of examples (`sources`).
         out: folder of checkpoints, logs, sheets and weights.
         validation: the same of other people; no validation without.
+        validated: how many of these are looked at, the first ones.
         variables: where to start a new run, for instance shipped weights; None for fresh ones.
         networks: of the losses that need them.
         fsdp: how many devices share one copy of the state, see `sharding.training_mesh`.
@@ -302,7 +304,7 @@ def train(
             for first, last in config.spans(begin, end):
                 part = config.at(first)
                 loader = stage_loader(make_source, config, first, mesh)
-                examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
+                examples = [] if unseen is None else validation_examples(unseen, part, validated)
                 batches = loader.batches(first, last, waiting=waiting)
                 for step, batch in batches:
                     if step == first and mesh is None:  # costs nothing: once, and the arrays are in memory
@@ -322,7 +324,7 @@ def train(
                     variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
                     if validating:
                         numbers, images = validate(variables, own_body, examples, part, own_networks)
-                        score = numbers["psnr"]
+                        score = None if math.isnan(numbers["psnr"]) else numbers["psnr"]  # NaN is no score
                         if leading:
                             _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
                     if leading:

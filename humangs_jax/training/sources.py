@@ -73,8 +73,11 @@ def cached_people(cache: PeopleCache) -> MakeSource:
     return make
 
 
-def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:
-    """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run."""
+def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False) -> MakeSource:
+    """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run.
+
+    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at random.
+    """
 
     def make(config: TrainConfig) -> Source:
         views = config.views
@@ -93,7 +96,7 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -
         if jax.default_backend() != "cpu":  # whole images, all views at once
             most = max(views.input_counts) + views.target_count
             drawn = dataclasses.replace(drawn, views_at_once=most, pixels_per_step=1 << 30)
-        return on_the_fly_source(bank, drawn, views.input_counts, on_host=jax.device_count() > 1)
+        return on_the_fly_source(bank, drawn, views.input_counts, jax.device_count() > 1, each_once)
 
     return make
 

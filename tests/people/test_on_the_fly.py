@@ -314,6 +314,33 @@ def test_a_bank_is_a_source_of_its_split(bank, example):
     again = jitted_example(bank, source.drawn_key(0, 3), config=CONFIG)
     np.testing.assert_array_equal(made.inputs.images, again.inputs.images)
     assert jax.tree.structure(made) == jax.tree.structure(example)
+    for index in range(3, 6):
+        betas = source.example(0, index, 2).inputs.betas
+        shown = np.abs(np.asarray(bank.betas) - np.asarray(betas)).max(axis=1) == 0
+        who = np.asarray(bank.seeds)[shown].item()
+        assert source.describe(0, index, 2) == f"synthetic person {who} in appearance {index}"
+
+
+def test_each_person_of_a_bank_is_shown_once_in_order(bank, example, monkeypatch):
+    asked = []
+
+    def make(bank, key, config, person):
+        asked.append((person, config))
+        return example
+
+    monkeypatch.setattr(on_the_fly, "jitted_example", make)
+    source = on_the_fly_source(bank, CONFIG, input_counts=(3,), each_once=True)
+    assert len(source) == bank.people == 2 and source.input_counts == (3,)
+    for index in range(2):
+        source.example(0, index, 3)
+    assert [person for person, _ in asked] == [0, 1] and asked[0][1].input_views == 3
+    assert source.describe(0, 1, 3) == f"synthetic person {SEEDS[1]} in appearance 1"
+
+
+@pytest.mark.parametrize("people", [1, 7, 1000, 20_000])
+def test_a_person_who_is_asked_for_is_the_one_who_is_picked(people):
+    numbers = jnp.arange(people)
+    np.testing.assert_array_equal(surroundings.pick((numbers + 0.5) / people, people), numbers)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import pytest
 
 from humangs_jax.training import ablation
 from humangs_jax.training.ablation import Ablation, ablate
+from humangs_jax.training.forward import as_validated
 
 CLASS_TOKEN = "model.architecture.encoder.transformer.class_token"
 WITHOUT = {"no class token": {CLASS_TOKEN: False}}
@@ -23,6 +24,21 @@ def trained(monkeypatch, tmp_path):
 
     monkeypatch.setattr(ablation, "train", stand_in)
     return runs
+
+
+class Nobody:
+    """A source without examples."""
+
+    input_counts, broken = (2,), {}
+
+    def __len__(self):
+        return 0
+
+    def example(self, seed, index, input_count):
+        raise AssertionError("not asked for")
+
+    def describe(self, seed, index, input_count):
+        return "nobody"
 
 
 def run(tmp_path, **how):
@@ -49,6 +65,77 @@ def test_a_budget_ends_before_a_run_and_a_later_call_goes_on(trained, tmp_path, 
     assert run(tmp_path, validation=[], seeds=2).missing == 0
 
 
+def test_a_budget_that_was_too_small_says_which_would_do(trained, tmp_path, monkeypatch):
+    times = iter(range(0, 10_000, 40))
+    monkeypatch.setattr(ablation.time, "monotonic", lambda: float(next(times)))
+    result = run(tmp_path, validation=[], seeds=2, budget="2min")
+    said = 'a run took up to 40s: the same call goes on, budget="3min" would do for the rest'  # 3 x 40 s, and a tenth
+    assert said in str(result).splitlines()
+    assert run(tmp_path, validation=[], seeds=2, budget="3h").missing == 0
+
+
+@pytest.mark.parametrize("scores", [{"base": {0: 1.0}, "a": {}}, {"base": {}, "a": {}}, {"base": {}, "a": {0: 2.0}}])
+def test_a_plot_without_a_difference_says_so_and_has_no_axis(scores):
+    pytest.importorskip("matplotlib")
+    figure = Ablation("psnr", scores, missing=1, longest=100.0).plot()
+    assert not figure.axes and figure.texts[0].get_text().startswith("no variant finished")
+    assert 'budget="2min" would do' in figure.texts[0].get_text()
+
+
+def test_variants_of_like_names_have_folders_of_their_own_inside_of_out(trained, tmp_path):
+    names = ("a b", "a_b", "A_B", "..", ".", "a/../../b", "x" * 300)
+    run(tmp_path / "out", validation=[], seeds=1, variants={name: {"loss.squared": 0.5} for name in names})
+    folders = {folder for folder, _ in trained}
+    assert len({folder.lower() for folder in folders}) == len(names) + 1 and {"base", "a_b"} <= folders
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == folders
+
+
+def test_all_variants_are_compared_on_the_photos_and_targets_of_the_base(trained, tmp_path, monkeypatch):
+    asked, validated = [], []
+    stand_in = ablation.train
+
+    def watched(config, body, people, folder, *, validation, validated: int, **how):
+        validation(as_validated(config))
+        asked.append((config.model.conventions.image_size, validated))
+        stand_in(config, body, people, folder, **how)
+
+    monkeypatch.setattr(ablation, "train", watched)
+    larger = {"model.conventions.image_size": 64, "views.input_counts": (1, 3), "views.target_count": 5, "steps": 80}
+
+    def make(config):
+        validated.append(config)
+        return Nobody()
+
+    run(tmp_path, validation=make, seeds=1, variants={"larger": larger})
+    base, other = validated
+    assert asked == [(32, 8), (64, 8)]  # the photos that a network reads are of its own size
+    assert [config.model.conventions.image_size for config in validated] == [32, 64]
+    assert other.views == base.views and other.target_size == base.target_size == 32
+    assert base.views.input_counts == (2,) and base.views.target_count == 2
+
+
+def test_each_of_the_people_to_compare_on_is_looked_at(trained, tmp_path, monkeypatch):
+    counts, made = [], []
+
+    def people(bank, each_once):
+        made.append((bank, each_once))
+        return lambda config: Nobody()
+
+    monkeypatch.setattr(ablation, "build_bank", lambda seeds, body, split, texture_size: len(seeds))
+    monkeypatch.setattr(ablation, "on_the_fly_people", people)
+    stand_in = ablation.train
+
+    def watched(*arguments, validated, **how):
+        counts.append(validated)
+        stand_in(*arguments, **how)
+
+    monkeypatch.setattr(ablation, "train", watched)
+    run(tmp_path / "a", validation=20, seeds=1, variants={})
+    run(tmp_path / "b", validation=["one", "two", "three"], seeds=1, variants={})
+    assert counts == [20, 3] and made == [(20, True)]
+
+
 def test_one_seed_has_no_interval():
     row = Ablation("psnr", {"base": {0: 20.0}, "a": {0: 21.0}}).rows[1]
     assert (row.difference, row.interval, row.clear) == (1.0, None, False)
@@ -62,11 +149,20 @@ def test_one_seed_has_no_interval():
         ({"seeds": 0}, "seeds 0: expected at least 1"),
         ({"budget": "soon"}, "budget 'soon': expected a time"),
         ({"metric": "mse"}, "'mse': is none of validation: psnr_fg"),
+        ({"metric": "lpips"}, "'lpips': is none of validation: psnr_fg"),
+        ({"variants": {"a": {"seed": 5}}}, "'a': seed: all variants have the seeds 0, 1"),
+        ({"variants": {"a": {}, "b": {"loss.lpips": 0.1}}}, "'b': loss.lpips: expected its network in networks"),
+        (
+            {"variants": {"a": {"model.architecture.encoder.transformer.head_width": 7}}},
+            "'a': width 16 is not a multiple of head_width 7",
+        ),
+        ({"variants": {"a": {"model.architecture.reader.sample_rgb": False}}}, "'a': "),
     ],
 )
-def test_what_cannot_be_meant_is_refused(how, said, trained, tmp_path):
+def test_what_cannot_be_meant_is_refused_before_the_first_run(how, said, trained, tmp_path):
     with pytest.raises(ValueError, match=said):
         run(tmp_path, validation=[], **how)
+    assert trained == [] and not any(tmp_path.iterdir())
 
 
 @pytest.mark.slow

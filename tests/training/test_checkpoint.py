@@ -65,6 +65,14 @@ def test_keeps_the_newest_and_the_best(tmp_path, checkpoints, same):
     again.close()
 
 
+def test_a_score_that_is_not_a_number_is_none(checkpoints):
+    for step, score in enumerate([float("nan"), 20.0, float("nan"), 19.0]):
+        checkpoints.save(state_at(step), score)
+    checkpoints.wait()
+    assert checkpoints.best_step == 1 and checkpoints.steps == [1, 2, 3]
+    assert [checkpoints.score(step) for step in (1, 2, 3)] == [20.0, None, 19.0]
+
+
 def largest_file(step):
     return max((step / "default").rglob("d/*"), key=lambda path: path.stat().st_size)
 

@@ -63,6 +63,22 @@ def test_a_finished_run_goes_on_when_it_gets_more_steps(run, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_first_validation_that_is_not_a_number_keeps_no_later_one_from_being_the_best(run, tmp_path, monkeypatch):
+    scores, validate = iter([float("nan"), 20.0]), loop.validate
+
+    def watched(*arguments):
+        numbers, images = validate(*arguments)
+        return numbers | {"psnr": next(scores)}, images
+
+    monkeypatch.setattr(loop, "validate", watched)
+    config = dataclasses.replace(CONFIG, validate_every=1, steps=2)
+    run(tmp_path, config, stop_at=1)
+    assert not (tmp_path / "best.safetensors").exists()
+    run(tmp_path, config, stop_at=2)
+    assert (tmp_path / "best.safetensors").is_file()
+
+
+@pytest.mark.slow
 def test_what_a_run_leaves_behind(whole):
     state, out = whole
     validations = [line for line in lines(out) if "val_psnr" in line]
