@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import logging
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.calibration.calibration import in_capture_convention, read_calibration
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.data.views import upright_world
@@ -29,7 +27,7 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import write_png
-from humangs_jax.io.reading import check_limit, reading
+from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SPLAT_PRESETS, SplatConfig, drawn_as
@@ -238,6 +236,15 @@ def excerpt(motion: Motion, start: float = 0.0, stop: float | None = None, fps: 
     return replace(part, rotations=turned, translations=jnp.asarray(moved, jnp.float32))
 
 
+def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
+    """A pose for each frame of a motion, which is put on the floor. Raises: ValueError for another number of joints."""
+    joints = motion.rotations.shape[1]
+    if joints != len(avatar.parents):
+        raise ValueError(f"the motion has {joints} joints, the avatar has {len(avatar.parents)}")
+    motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+    return jax.vmap(BodyPose)(motion.rotations, motion.translations)
+
+
 def motion_views(avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True) -> tuple[BodyPose, Camera]:
     """A pose and a camera for each frame of a motion, which is put on the floor.
 
@@ -246,12 +253,7 @@ def motion_views(avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, 
 
     Raises: ValueError if the motion has another number of joints than the avatar, or the shot is out of range.
     """
-    joints = motion.rotations.shape[1]
-    if joints != len(avatar.parents):
-        raise ValueError(f"the motion has {joints} joints, the avatar has {len(avatar.parents)}")
-    motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
-    count = len(motion.translations)
-    poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)
+    poses, count = motion_poses(avatar, motion), len(motion.translations)
     azimuths = turn * np.arange(count) / count
     return poses, shot_cameras(shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None)
 
@@ -323,9 +325,10 @@ def without_unseen(avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatC
 # Views of any Gaussians, those of other programs too: from a circle of cameras, or from the cameras of a calibration ---
 
 
-logger = logging.getLogger(__name__)
-SHOWN = 0.9
+SHOWN, NEARLY_ALL = 0.9, 0.999
 """Of the opaque Gaussians, those that a circle of cameras is made to show: outliers are far away."""
+COMPACT = 3.0
+"""Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no outliers: all are shown."""
 ROOM = 1.1
 PAIRS = 4_000_000
 """(splat, tile) pairs that are drawn at once: some hundred megabytes."""
@@ -336,6 +339,11 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
     means = np.asarray(gaussians.means)[np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)]
     middle = np.median(means, axis=0) if len(means) else np.zeros(3)
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN) if len(means) else 1.0
+    if len(means):
+        low, high = np.quantile(means, [1 - NEARLY_ALL, NEARLY_ALL], axis=0)
+        whole = np.linalg.norm(means - (low + high) / 2, axis=1)
+        if np.quantile(whole, NEARLY_ALL) < COMPACT * radius:
+            middle, radius = (low + high) / 2, np.quantile(whole, NEARLY_ALL)
     distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
     turn = up_matrix(up)  # the file's world from one with y up
     cameras = orbit(
@@ -350,31 +358,6 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
     turned[:, :3, :3] = turned[:, :3, :3] @ turn.T
     each = replace(cameras, cam_from_world=jnp.asarray(turned))
     return {f"view_{i:03d}": camera for i, camera in enumerate(each)}
-
-
-def file_cameras(path: Path, shot: Shot) -> dict[str, Camera]:
-    """The cameras of a calibration in the world of its file, by unique names; lens distortion is left out, which is logged.
-
-    Images are as large as the file says. Where it does not say, or the shot has a width or a height, they are those of the shot.
-    Raises: CaptureError, one line that names the file.
-    """
-    with reading(path, "calibration"):
-        found = read_calibration(path, lambda name: shot.resolution)
-        check_limit("views", len(found.cameras), "cameras")
-        found = in_capture_convention(found, 1.0, "+y", found.pixel_centers)  # the axes stay those of the file
-    if any(camera.distortion is not None and np.any(camera.distortion) for camera in found.cameras):
-        logger.warning("%s: images are drawn without the distortion of lenses", path)
-    cameras: dict[str, Camera] = {}
-    for each in found.cameras:
-        size = each.width or shot.resolution[0], each.height or shot.resolution[1]
-        camera = Camera.from_opencv(each.K, each.cam_from_world, *size)
-        if shot.width or shot.height:
-            camera = camera.resized(shot.width or size[0], shot.height or size[1])
-        plain = stem = Path(each.name.replace("\\", "/")).stem.lstrip(".") or "view"
-        while stem in cameras:
-            stem = f"{plain}_{len(cameras)}"
-        cameras[stem] = camera
-    return cameras
 
 
 def splat_images(gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> Iterator[Float[np.ndarray, "h w c"]]:

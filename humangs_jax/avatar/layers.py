@@ -100,16 +100,18 @@ def write_views(
     exr: ExrLayers | None = None,
     progress: bool = True,
     exposures: Float[np.ndarray, "v 3"] | None = None,
+    names: Sequence[str] | None = None,
 ) -> int:
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and views.exr if asked.
 
-    exposures: of the cameras, see `data.views`.
+    exposures: of the cameras, see `data.views`. names: of the images, instead of view_000 and so on.
 
     The files appear together when all are drawn; other views of an earlier call are removed. Returns the number of views.
 
     Raises: ValueError if the layers of all views are more than an EXR file may hold (see docs/security.md); OSError.
     """
     out, count = Path(out), len(poses)
+    names = [f"view_{i:03d}" for i in range(count)] if names is None else names
     if exr is not None:
         exr.check()
         most, size = limits().array_bytes, exr.bytes_of(count, cameras.width, cameras.height)
@@ -123,9 +125,9 @@ def write_views(
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
         views = []
         for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", shown=progress)):
-            write_png(folder / f"view_{i:03d}.png", image_of(rendering, shot.color()))
+            write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()))
             if exr is not None:
-                views.append(exr_view(f"view_{i:03d}", avatar, poses[i], cameras[i], rendering, exr.layers, how))
+                views.append(exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how))
         if exr is not None:
             write_exr(folder / EXR_NAME, views, half=exr.half)
 

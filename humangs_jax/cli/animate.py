@@ -28,6 +28,8 @@ _SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).s
 FROM_THE_SIDE = Shot(azimuth=20.0)
 SPLATS = {suffix: each.up for each in EXPORTS.values() if not each.mesh for suffix in each.suffixes}
 """Files of Gaussians, and the axis that points up in them."""
+OF_A_FILE = "Cameras of a file: of Gaussians in its world, of an avatar around a person who stands on the floor."
+PATH = "Cameras of a file instead: one stands still, several are a path over the whole motion, around a person on the floor."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Animate:
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs animate avatar.npz --motion dance.bvh --out dance.mp4",
-        "humangs animate avatar.npz --turn 360 --background transparent --out walk.webm",
+        "humangs animate avatar.npz --camera path.json --background transparent --out walk.webm",
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
@@ -49,6 +51,7 @@ class Animate:
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path("animation.mp4")
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
+    camera: Annotated[Path | None, arg(help=f"{PATH} {CAMERAS.listed()}")] = None
     follow: Annotated[bool, off("follow the person: the camera stands still and sees everywhere that the person goes")] = True
     """The camera goes along with the person."""
     fps: Annotated[float | None, RATE] = None
@@ -65,9 +68,13 @@ class Animate:
     """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
+        if self.camera is not None:
+            said = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
+            _require_no_circle("--camera", self.shot, FROM_THE_SIDE, said)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
-            from humangs_jax.avatar.frames import excerpt, images, motion_views
+            from humangs_jax.avatar.camera_paths import camera_path, file_cameras, one_size
+            from humangs_jax.avatar.frames import excerpt, images, motion_poses, motion_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.io.reading import reading
 
@@ -78,18 +85,23 @@ class Animate:
             motion = self.part.load(self.motion, avatar.rest_joints)
             with reading(self.motion or "the motion", "motion"):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
-            check_video(self.out, len(motion.translations), *self.shot.resolution)
-            poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
+            frames = len(motion.translations)
+            if self.camera is None:
+                poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
+            else:
+                found = one_size(self.camera, file_cameras(self.camera, shot, upright=True))
+                poses, cameras = motion_poses(avatar, motion), camera_path(found, frames)
+            check_video(self.out, frames, cameras.width, cameras.height)
         avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             written = write_video(self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps)
-        wrote(self.out, f"{written} frames of {_size(self.shot, self.out)} at {motion.fps:g} frames per second")
+        wrote(self.out, f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {motion.fps:g} frames per second")
         suggest("humangs export", self.avatar, "--html avatar.html", *self.part.options(self.motion))
 
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, or those of a capture; or Gaussians of any program.
+    """Render an avatar from a circle of cameras, or those of a file or capture; or Gaussians of any program.
 
     As images, as layers of an EXR file, or as a video of one turn (docs: video).
     """
@@ -101,7 +113,7 @@ class Render:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[Shot]
-    camera: Annotated[Path | None, arg(help=f"Of Gaussians: cameras of a file, in its world. {CAMERAS.listed()}")] = None
+    camera: Annotated[Path | None, arg(help=f"{OF_A_FILE} {CAMERAS.listed()}")] = None
     out: Annotated[Path, VIDEO, arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}")] = Path("views")
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
@@ -128,14 +140,12 @@ class Render:
             views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
         if video and self.exr:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
-        if self.capture is not None:
-            self._require_defaults()
+        self._require_one_kind_of_cameras()
         if self.avatar.suffix.lower() in (*SPLATS, *OTHERS):
             return self._render_gaussians(views)
-        if self.camera is not None:
-            raise UsageError(f"--camera: {self.avatar} is an avatar, which --capture gives cameras and poses")
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.avatar.camera_paths import file_cameras, one_size, repeated, standing
             from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
             from humangs_jax.avatar.layers import ExrLayers, write_views
             from humangs_jax.avatar.video import check_video, write_video
@@ -148,8 +158,13 @@ class Render:
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
-            exposed = None
-            if self.capture is not None:
+            exposed = names = None
+            if self.camera is not None:
+                found = file_cameras(self.camera, shot, upright=True)
+                cameras, names = one_size(self.camera, found), list(found)
+                pose = standing(avatar, rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar))
+                poses = repeated(pose, len(names))
+            elif self.capture is not None:
                 capture = load_capture(self.capture)
                 (poses, cameras), exposed = capture_views(avatar, capture), exposures(capture)
             else:
@@ -159,11 +174,11 @@ class Render:
         with stage("drawing"):
             if video:
                 written = write_video(self.out, images(avatar, poses, cameras, shot, "render"), self.fps)
-                what = f"{written} frames of {_size(self.shot, self.out)} at {self.fps:g} frames per second"
+                what = f"{_counted(written, 'frame')} of {_size(self.out, cameras)} at {self.fps:g} frames per second"
             else:
                 exr = layers if self.exr else None
-                written = write_views(self.out, avatar, poses, cameras, shot, exr, exposures=exposed)
-                what = f"{written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
+                written = write_views(self.out, avatar, poses, cameras, shot, exr, exposures=exposed, names=names)
+                what = f"{_counted(written, 'view')} of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
 
@@ -171,11 +186,12 @@ class Render:
         said = {"pose": self.pose != "t", "capture": self.capture, "exr": self.exr, "prune": self.shot.prune}
         if wrong := [name for name, given in said.items() if given]:
             raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
-        if self.camera is not None and (self.out.suffix or self.views is not None):
-            raise UsageError("--camera: expected a folder as --out, and no --views")
+        if self.camera is not None and self.out.suffix:
+            raise UsageError("--camera: expected a folder as --out")
         with stage("starting"):
             from humangs_jax import load_gaussians
-            from humangs_jax.avatar.frames import circle_cameras, file_cameras, splat_images, write_splat_views
+            from humangs_jax.avatar.camera_paths import file_cameras
+            from humangs_jax.avatar.frames import circle_cameras, splat_images, write_splat_views
             from humangs_jax.avatar.video import check_video, write_video
 
             check_video(self.out, views, *self.shot.resolution, transparent=self.shot.color() is None and self.out.suffix != "")
@@ -189,20 +205,23 @@ class Render:
         with stage("drawing"):
             if self.out.suffix:
                 count = write_video(self.out, splat_images(gaussians, cameras, shot), self.fps)
-                what = f"{count} frames of {_size(self.shot, self.out)} at {self.fps:g} frames per second"
+                size = _size(self.out, next(iter(cameras.values())))
+                what = f"{_counted(count, 'frame')} of {size} at {self.fps:g} frames per second"
             else:
-                what = f"{write_splat_views(self.out, gaussians, cameras, shot)} views"
+                what = _counted(write_splat_views(self.out, gaussians, cameras, shot), "view")
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
-    def _require_defaults(self) -> None:
-        """With --capture nothing is said about the cameras. Raises: UsageError naming the first option that does."""
-        free, usual = ("background", "splat", "prune"), Shot()
-        said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
-        said += ["views"] * (self.views is not None) + ["pose"] * (self.pose != "t")
-        if said:
-            raise UsageError(f"--{said[0]}: not with --capture, which has cameras and poses of its own")
-        if self.out.suffix:
-            raise UsageError(f"--out {self.out}: expected a folder: the views of a capture are no video")
+    def _require_one_kind_of_cameras(self) -> None:
+        """With --capture or --camera nothing else is said about the cameras. Raises: UsageError naming the first option."""
+        said = ["views"] * (self.views is not None)
+        if self.capture is not None:
+            said += ["camera"] * (self.camera is not None) + ["pose"] * (self.pose != "t")
+            said += [name for name in ("size", "width", "height") if getattr(self.shot, name) != getattr(Shot(), name)]
+            _require_no_circle("--capture", self.shot, Shot(), said)
+            if self.out.suffix:
+                raise UsageError(f"--out {self.out}: expected a folder: the views of a capture are no video")
+        elif self.camera is not None:
+            _require_no_circle("--camera", self.shot, Shot(), said)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,9 +285,28 @@ def _pruned(avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: Shot) 
     return seen
 
 
-def _size(shot: Shot, path: Path) -> str:
+ON_A_CIRCLE = ("azimuth", "elevation", "distance", "fov")
+"""Fields of a shot that say where cameras on a circle stand."""
+
+
+def _require_no_circle(option: str, shot: Shot, usual: Shot, said: list[str]) -> None:
+    """Nothing is said about a circle of cameras beside an option that has its own. said: names of other options that are given.
+
+    Raises: UsageError naming the first.
+    """
+    said = [name for name in ON_A_CIRCLE if getattr(shot, name) != getattr(usual, name)] + said
+    if said:
+        own = "cameras and poses" if option == "--capture" else "cameras"
+        raise UsageError(f"--{said[0]}: not with {option}, which has {own} of its own")
+
+
+def _counted(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def _size(path: Path, camera: "Camera") -> str:
     """The size of the file, which may have another row or column than what is drawn."""
     from humangs_jax.avatar.video import video_size
 
-    width, height = video_size(path, *shot.resolution)
+    width, height = video_size(path, camera.width, camera.height)
     return f"{width} x {height}"

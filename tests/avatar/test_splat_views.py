@@ -9,8 +9,10 @@ import pytest
 
 import humangs_jax as hg
 from humangs_jax import cli
-from humangs_jax.avatar.frames import circle_cameras, file_cameras
+from humangs_jax.avatar.camera_paths import file_cameras
+from humangs_jax.avatar.frames import circle_cameras
 from humangs_jax.avatar.shot import Shot
+from humangs_jax.geometry.camera import project
 from humangs_jax.io.images import read_image
 
 STEP = 0.51 / 255
@@ -47,6 +49,32 @@ def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
     rgb, alpha = np.asarray(drawn.rgb), np.asarray(drawn.alpha)
     green = (rgb[..., 1] * alpha).sum(1) / np.maximum(alpha.sum(1), 1e-6)
     assert green[alpha.sum(1) > 5][0] < green[alpha.sum(1) > 5][-1]
+
+
+def person_like(far=0):
+    """Centres in a box of a person with its arms out, fewer in the feet, and some far away."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-1, 1, (2000, 3)) * [0.25, 0.5, 0.15] + [0, 1.2, 0]
+    arms, feet = rng.uniform(-1, 1, (200, 3)) * [0.9, 0.05, 0.05] + [0, 1.4, 0], rng.uniform(-0.1, 0.1, (60, 3))
+    means = np.concatenate([body, arms, feet, rng.uniform(20, 30, (far, 3))])
+    count = len(means)
+    arrays = means, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), 0.01), np.full(count, 0.9), np.full((count, 3), 0.5)
+    return hg.Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays))
+
+
+@pytest.mark.parametrize("size", [(64, 64), (40, 64), (64, 40)])
+def test_a_person_of_a_file_is_shown_with_a_margin(size):
+    gaussians = person_like()
+    for camera in circle_cameras(gaussians, "y", 4, Shot(width=size[0], height=size[1])).values():
+        uv, depth = project(camera, gaussians.means)
+        assert (depth > 0).all()
+        assert (uv > 0.02 * np.asarray(size)).all() and (uv < 0.98 * np.asarray(size)).all()
+
+
+def test_what_is_far_away_of_a_scene_does_not_make_it_small():
+    near = circle_cameras(person_like(), "y", 1, Shot(size=64))["view_000"]
+    far = circle_cameras(person_like(40), "y", 1, Shot(size=64))["view_000"]
+    assert np.linalg.norm(far.center) < 1.5 * np.linalg.norm(near.center)
 
 
 def test_cameras_of_a_file_are_in_the_world_of_the_gaussians(tmp_path, monkeypatch):

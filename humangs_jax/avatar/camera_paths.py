@@ -1,0 +1,97 @@
+"""Cameras of a file: as they stand in its world, or as a path along which an avatar is seen.
+
+The person stands on the floor, at the middle of a world with y up and in metres, as in the motions of `motion_views` and in the
+files of `export`. Formats whose world has another axis up are turned.
+"""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import rest_pose_of
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.calibration.calibration import in_capture_convention, read_calibration
+from humangs_jax.data.motion import Motion, grounded
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.reading import check_limit, reading
+
+logger = logging.getLogger(__name__)
+
+
+def file_cameras(path: Path, shot: Shot, upright: bool = False) -> dict[str, Camera]:
+    """The cameras of a calibration, in the order of its file, by unique names; lens distortion is left out, which is logged.
+
+    Images are as large as the file says. Where it does not say, or the shot has a width or a height, they are those of the shot.
+
+    Arguments: upright: turn the world from the axis that the format has up to y. False: it stays that of the file.
+    Raises: CaptureError, one line that names the file.
+    """
+    with reading(path, "calibration"):
+        found = read_calibration(path, lambda name: shot.resolution)
+        check_limit("views", len(found.cameras), "cameras")
+        found = in_capture_convention(found, 1.0, found.up if upright else "+y", found.pixel_centers)
+    if any(camera.distortion is not None and np.any(camera.distortion) for camera in found.cameras):
+        logger.warning("%s: images are drawn without the distortion of lenses", path)
+    cameras: dict[str, Camera] = {}
+    for each in found.cameras:
+        size = each.width or shot.resolution[0], each.height or shot.resolution[1]
+        camera = Camera.from_opencv(each.K, each.cam_from_world, *size)
+        if shot.width or shot.height:
+            camera = camera.resized(shot.width or size[0], shot.height or size[1])
+        plain = stem = Path(each.name.replace("\\", "/")).stem.lstrip(".") or "view"
+        while stem in cameras:
+            stem = f"{plain}_{len(cameras)}"
+        cameras[stem] = camera
+    return cameras
+
+
+def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
+    """A batch of the cameras of a file. Raises: ValueError if their images differ in size."""
+    sizes = {(camera.width, camera.height): name for name, camera in cameras.items()}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{name} has {width} x {height}" for (width, height), name in sorted(sizes.items())[:2])
+        raise ValueError(f"{path}: images of several sizes, {shown}: expected one size, or --width and --height")
+    return stack_cameras(list(cameras.values()))
+
+
+def camera_path(cameras: Camera, frames: int) -> Camera:
+    """A camera for each frame, from a batch of them: one stands still; several are evenly spread over the frames.
+
+    Between them centres and intrinsics run along a monotone cubic spline (Fritsch and Carlson 1980), which goes through all of
+    them and does not overshoot; rotations turn about one axis at constant speed.
+    """
+    count = len(cameras)
+    if count in (1, frames):
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (frames, *x.shape[1:])), cameras)
+    from scipy.interpolate import PchipInterpolator
+    from scipy.spatial.transform import Rotation, Slerp
+
+    places, times = np.arange(count), np.linspace(0, count - 1, frames)
+    poses = np.asarray(cameras.cam_from_world, np.float64)
+    rotations = Slerp(places, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
+    centers = PchipInterpolator(places, np.asarray(cameras.center, np.float64))(times)
+    between = np.tile(np.eye(4), (frames, 1, 1))
+    between[:, :3, :3] = rotations
+    between[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers)
+    K = PchipInterpolator(places, np.asarray(cameras.K, np.float64))(times)
+    dtype = cameras.K.dtype
+    return replace(cameras, K=jnp.asarray(K, dtype), cam_from_world=jnp.asarray(between, dtype))
+
+
+def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
+    """A pose (default: the T-pose) moved so that the person stands on the floor, at x = z = 0."""
+    pose = rest_pose_of(avatar) if pose is None else pose
+    moment = Motion(pose.rotations[None], pose.translation[None], 1.0)
+    return grounded(moment, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents).pose(0)
+
+
+def repeated(pose: BodyPose, views: int) -> BodyPose:
+    """A batch of one pose."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (views, *x.shape)), pose)
