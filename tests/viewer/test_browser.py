@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bvh_files import CMU, MIXAMO, rest_frames, write_bvh
+from glb_files import write_glb
 from scipy.spatial.transform import Rotation
 
 from experiments import chromium
@@ -274,6 +275,28 @@ def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, 
         assert np.arccos(np.clip((ours * theirs).sum(1), -1, 1)).max() < ANGLE
         if arms_down == turned == 0:
             np.testing.assert_allclose(matrices(rotations), matrices(poses[frame]), atol=ANGLE)
+
+
+def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avatar, tmp_path):
+    clips = [random_motion(3, seed=seed)[0].reshape(3, 55, 3) for seed in (0, 1)]
+    for poses in clips:
+        poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in BODY]] = 0
+    rest, still = np.asarray(avatar.rest_joints, float), np.zeros((3, 3))
+    write_glb(tmp_path / "two.glb", rest, clips[0], still, MIXAMO, more=clips[1:], titles=("walk", "run"))
+    said = drop(browser, "two.glb", (tmp_path / "two.glb").read_bytes())
+    assert "3 frames" in said and "2 animations (walk, run): the first is taken" in said
+    np.testing.assert_allclose(matrices(shown_pose(browser, 2)[0]), matrices(clips[0][2]), atol=ANGLE)
+    assert browser.run("return document.getElementById('clip-row').innerText").split() == ["Animation", "walk", "run"]
+    browser.run(
+        """document.getElementById("message").textContent = "";
+        const select = document.getElementById("clip");
+        select.value = "1";
+        select.dispatchEvent(new Event("change"));
+        while (!document.getElementById("message").textContent) await new Promise((resolve) => setTimeout(resolve, 20));"""
+    )
+    np.testing.assert_allclose(matrices(shown_pose(browser, 2)[0]), matrices(clips[1][2]), atol=ANGLE)
+    drop(browser, "one.npz", npz(rotations=np.zeros((2, 55, 3)), translations=np.zeros((2, 3)), fps=24))
+    assert browser.run("return document.getElementById('clip-row').hidden")
 
 
 def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):

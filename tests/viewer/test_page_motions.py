@@ -31,10 +31,10 @@ const given = JSON.parse(require("fs").readFileSync(0, "utf8")), { scene } = giv
 scene.order = jointOrder(scene.parents);
 (async () => {
   const found = [];
-  for (const [name, content, rate] of given.files) {
+  for (const [name, content, rate, clip] of given.files) {
     const bytes = Buffer.from(content, "base64");
     const file = { name, size: bytes.length, arrayBuffer: async () => new Uint8Array(bytes).buffer };
-    found.push(await readMotionFile(file, scene, rate ?? null)
+    found.push(await readMotionFile(file, scene, rate ?? null, clip ?? 0)
       .catch(({ message, asksRate }) => ({ error: message, asksRate })));
   }
   process.stdout.write(JSON.stringify(found));
@@ -43,7 +43,7 @@ scene.order = jointOrder(scene.parents);
 
 
 def page_reads(files, names=JOINT_NAMES, parents=PARENTS, rest=None):
-    """What the page makes of files, [(name, bytes, frames per second that are asked for or nothing)].
+    """What the page makes of files, [(name, bytes)]; frames per second and the index of the clip may follow.
 
     Motions as JSON, or {"error": ..., "asksRate": ...}.
     """
@@ -51,7 +51,7 @@ def page_reads(files, names=JOINT_NAMES, parents=PARENTS, rest=None):
 
     rest = shipped_joints() if rest is None else rest
     scene = {"rest": np.asarray(rest).tolist(), "parents": list(parents), "names": list(names)}
-    given = {"scene": scene, "files": [(name, base64.b64encode(content).decode(), *rate) for name, content, *rate in files]}
+    given = {"scene": scene, "files": [(name, base64.b64encode(content).decode(), *more) for name, content, *more in files]}
     program = page_script("kinematics", "scene", "motion_files", "skeletons", "glb") + PROGRAM
     done = subprocess.run(
         [str(NODE), "--input-type=commonjs", "-e", program],
@@ -202,6 +202,17 @@ def glb_files(folder):
 
 def test_the_page_reads_animations_as_python_does(tmp_path, caplog):
     compare(tmp_path, caplog, dict(glb_files(tmp_path)))
+
+
+def test_any_of_the_animations_in_a_file_can_be_had(tmp_path):
+    clips = [dance(3, seed=seed) for seed in range(3)]
+    options = {"more": clips[1:], "titles": ("walk", "run", "jump")}
+    write_glb(tmp_path / "a.glb", shipped_joints(), clips[0], np.zeros((3, 3)), MIXAMO, **options)
+    content = (tmp_path / "a.glb").read_bytes()
+    for poses, page in zip(clips, page_reads([("a.glb", content, None, i) for i in range(3)]), strict=True):
+        assert page["clips"] == ["walk", "run", "jump"]
+        theirs = Rotation.from_quat(np.reshape(page["quats"], (-1, 4))[:, [1, 2, 3, 0]]).as_matrix()
+        np.testing.assert_allclose(theirs, matrices(poses), atol=EXACT)
 
 
 def animation_file(folder, times=None, turns=None, wrong=None, **document):

@@ -111,7 +111,8 @@ function makeControls(app) {
       for (const [name, j] of members) {
         const joint = Object.assign(document.createElement("div"), { className: "joint" });
         joint.append(Object.assign(document.createElement("b"), { textContent: plainName(name) }));
-        turns.forEach((does, axis) => {
+        const own = /thumb/.test(name) ? PLAIN_TURNS : turns;  // thumbs point along no axis
+        own.forEach((does, axis) => {
           const letter = "xyz"[axis], label = `${plainName(name)}, about ${letter} (${does}), degrees`;
           const value = app.degrees[j][axis];
           const range = { low: -reach, high: reach, value, home: 0, step: 0.5, shown: inDegrees };
@@ -155,18 +156,25 @@ function makeControls(app) {
   }
 
   // ---- files ----
-  // rate: frames per second that somebody has said; null: those of the file.
-  async function openMotion(file, rate = null) {
+  // rate: frames per second that somebody has said; null: those of the file. clip: the index of its motion.
+  async function openMotion(file, rate = null, clip = 0) {
     if (!file) return;
     element("ask-rate").hidden = true;
     try {
-      const motion = await readMotionFile(file, scene, rate);
+      const motion = await readMotionFile(file, scene, rate, clip);
       app.setMotion(motion, file.name);
+      offerClips(file, motion.clips ?? [], clip);
       say(`${file.name}: ${counted(scene.motion.quats.length, "frame")}${motion.said ? `; ${motion.said}` : ""}`);
     } catch (error) {
       if (error.asksRate) askRate(file, error.message);
       else say(error.message, true);
     }
+  }
+  function offerClips(file, names, chosen) {
+    const select = element("clip");
+    select.replaceChildren(...names.map((name, i) => new Option(name, i, false, i === chosen)));
+    select.onchange = () => openMotion(file, null, select.selectedIndex);
+    element("clip-row").hidden = names.length < 2;
   }
   function askRate(file, question) {
     element("rate-question").textContent = question;

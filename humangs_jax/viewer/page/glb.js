@@ -1,4 +1,4 @@
-// The first animation of a GLB file, on the joints of its skin: as read_animation in
+// An animation of a GLB file, on the joints of its skin: as read_animation in
 // humangs_jax/data/motion/clips.py.
 // The rest pose is the one in which the skin was bound to the mesh, without a skin that of the nodes.
 // A place in space is { m: 3 x 3, t: [x, y, z] }.
@@ -14,11 +14,11 @@ const GLB_NUMBERS = new Map([
 const SHOWN_CLIPS = 12;
 const STEP_ROUNDING = 0.01;  // of a frame: keys are rounded to float32
 
-// A clip as in skeletons.js.
-function parseGlb(bytes) {
+// A clip as in skeletons.js, with the names of all clips in the file. index: of the one that is wanted.
+function parseGlb(bytes, index = 0) {
   const { content, binary } = glbChunks(bytes);
   try {
-    return glbClip(content, binary);
+    return glbClip(content, binary, index);
   } catch (error) {
     if (!(error instanceof TypeError || error instanceof RangeError)) throw error;
     throw new Error("a damaged GLB file: parts that it names are missing");
@@ -45,15 +45,15 @@ function glbChunks(bytes) {
   return { content, binary: new DataView(bytes.buffer, bytes.byteOffset + start, size) };
 }
 
-function glbClip(content, binary) {
+function glbClip(content, binary, index) {
   const nodes = content.nodes ?? [], animations = content.animations ?? [];
   if (!animations.length)
     throw new Error("a GLB file without an animation: expected a skeleton in motion");
   const names = animations.map((each, i) => String(each.name ?? i));
   const listed = names.slice(0, SHOWN_CLIPS).join(", ") + (names.length > SHOWN_CLIPS ? ", ..." : "");
-  const said = names.length > 1 ? `${names.length} animations (${listed}): the first is taken` : "";
+  const said = names.length > 1 && index === 0 ? `${names.length} animations (${listed}): the first is taken` : "";
   const parents = glbParents(nodes), { joints, binding } = glbJoints(content, binary, nodes);
-  const order = withAncestors(joints, parents), tracks = glbTracks(content, binary, animations[0], new Set(order));
+  const order = withAncestors(joints, parents), tracks = glbTracks(content, binary, animations[index], new Set(order));
   const { times, fps } = glbTimes([...tracks.values()].flatMap((byPath) => [...byPath.values()]));
   const posed = times.map((_, frame) => placesOfNodes(nodes, parents, order, tracks, times, frame));
   const rest = placesOfNodes(nodes, parents, order, new Map(), [0], 0);
@@ -71,7 +71,7 @@ function glbClip(content, binary) {
   };
   const nameOf = (joint) => humanoid.get(joint) ?? String(nodes[joint].name ?? "");
   const named = joints.map((joint) => ({ name: nameOf(joint), parent: above(joint) }));
-  return { joints: named, place: bound.map(({ t }) => t), own, fps, up: "y", said };
+  return { joints: named, place: bound.map(({ t }) => t), own, fps, up: "y", said, names };
 }
 
 // ---- nodes ----

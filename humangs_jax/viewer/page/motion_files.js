@@ -5,15 +5,16 @@
 
 const LARGEST_FILE = 512 * 2 ** 20;
 
-// { quats, translations, fps, said } for the scene's joints; said: what is to be told about the file.
+// { quats, translations, fps, said, clips } for the scene's joints; said: what is to be told about the file.
+// clips: names of the motions in the file, where it has several; clip: the index of the one that is wanted.
 // rate: frames per second that somebody has said; null: those of the file. An error that asksRate can be
 // answered with one.
-async function readMotionFile(file, scene, rate = null) {
+async function readMotionFile(file, scene, rate = null, clip = 0) {
   if (file.size > LARGEST_FILE) throw new Error(`${file.name}: larger than 512 MB`);
   const bytes = new Uint8Array(await file.arrayBuffer()), text = () => new TextDecoder().decode(bytes);
   try {
     if (/\.bvh$/i.test(file.name)) return checkedMotion(retargeted(parseBvh(text(), rate), scene));
-    if (/\.(glb|vrma)$/i.test(file.name)) return checkedMotion(retargeted(parseGlb(bytes), scene));
+    if (/\.(glb|vrma)$/i.test(file.name)) return checkedMotion(retargeted(parseGlb(bytes, clip), scene));
     if (/\.(npz|smpl)$/i.test(file.name)) return checkedMotion(motionFromArrays(await readNpz(bytes), scene, rate));
   } catch (error) {
     throw Object.assign(new Error(`${file.name}: ${error.message}`), { asksRate: Boolean(error.asksRate) });

@@ -285,7 +285,7 @@ function retargeted(clip, scene) {
   const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - ofBody[f], 0]), rest("pelvis")));
   const whole = Math.round(clip.fps);  // BVH has 0.0083333 for 120
   const fps = Math.abs(clip.fps - whole) < RULES.RATE_ROUNDING * clip.fps ? whole : clip.fps;
-  return { quats, translations, fps, said: [clip.said, found.said].filter(Boolean).join("; ") };
+  return { quats, translations, fps, clips: clip.names, said: [clip.said, found.said].filter(Boolean).join("; ") };
 }
 
 const NEXT = new Map(Object.entries(RULES.NEXT));
