@@ -332,6 +332,8 @@ def whole(path: Path) -> bool:
     """Whether a file that no two runs write equally is complete: a log may end in a part of a line."""
     if path.suffix == ".safetensors":
         return weights_are_whole(path.read_bytes())
+    if path.suffix == ".png":  # which ends in a chunk of this name and its checksum
+        return path.read_bytes()[-8:-4] == b"IEND"
     text = path.read_text()
     lines = text.splitlines() if path.suffix == ".jsonl" else [text]
     for line in lines[:-1] if path.suffix == ".jsonl" and not text.endswith("\n") else lines:
