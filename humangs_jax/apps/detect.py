@@ -14,19 +14,20 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.apps.same_people import Found, PhotoPeople, inside_photo, is_unclear, rivals, same_people
-from humangs_jax.apps.start import photo_files
+from humangs_jax.apps.start import photo_files, scan_photos
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
+from humangs_jax.data.folders import unused_line
 from humangs_jax.data.keypoints.formats import ImagePeople, seen_person, write_people
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import box_of
 from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
 from humangs_jax.io.atomic import add_files
-from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
+from humangs_jax.io.images import MASK, orientation, oriented, read_image, resized, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
@@ -52,6 +53,11 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
     images, files = photo_files(folder)
     names = [file.relative_to(images).as_posix() for file in files]
     return same_people(detect_photos(names, map(upright, files)))
+
+
+def left_out(folder: Path) -> str | None:
+    """What `found_in_photos` does not use of a folder, in one line; None where it uses all. Raises: as it."""
+    return None if (folder / "capture.json").is_file() else unused_line(scan_photos(folder).unused)
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
@@ -263,7 +269,7 @@ def write_found(
         write_sheet(temporary / SHEET_FILE, photos, person)
         for photo, file in zip(photos, files, strict=True) if masks else ():
             (temporary / file).parent.mkdir(parents=True, exist_ok=True)
-            write_png(temporary / file, person_mask(photo, person))
+            write_png(temporary / file, person_mask(photo, person), mark=MASK)
         if masks and to_capture:
             description = read_description(folder / "capture.json")
             views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]

@@ -19,6 +19,7 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.calibration.importing import ImportReport, import_calibration
 from humangs_jax.data.calibration.photos import upright_mask
+from humangs_jax.data.calibration.videos import named_after
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.data.keypoints.reading import read_keypoints
@@ -74,7 +75,8 @@ def import_photos(
         if reduce and (smaller := _reduced(images, files, Path(place))):
             found = _look(Path(place), files, smaller, choice)
             if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
-                return _written(found, Path(place), out, height, None, own_masks, also)
+                with named_after(Path(place), images):
+                    return _written(found, Path(place), out, height, None, own_masks, also)
     return _written(_look(images, files, files, choice), images, out, height, masks, own_masks, also)
 
 
@@ -171,7 +173,7 @@ def _written(
 ) -> PhotosImported:
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
-    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks, also=also)
+    report = import_calibration(_calibration(seen, found, images), images, out, masks=masks, scale=1.0, also=also)
     views = read_description(out / "capture.json")["views"]
     written = []
     for view, mirrored, described in zip(found.views, found.mirrored, views, strict=True):

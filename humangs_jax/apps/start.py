@@ -5,7 +5,7 @@ person an avatar is where no photo was.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import Float, PyTree
 from humangs_jax.data.body_and_masks import usable_views
-from humangs_jax.data.calibration.photos import PHOTO_SUFFIXES, is_photo, is_transparent
+from humangs_jax.data.calibration.photos import MASK_FOLDERS, is_transparent
 from humangs_jax.data.calibration.videos import (
     LONGER_SIDE,
     PHOTOS,
@@ -24,22 +24,30 @@ from humangs_jax.data.calibration.videos import (
     looked_at,
     write_frames,
 )
-from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.folders import (
+    ELSEWHERE,
+    PHOTO_SUFFIXES,
+    VIDEO_SUFFIXES,
+    FolderScan,
+    Unused,
+    is_video,
+    scan_folder,
+    unused_line,
+)
 from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 from humangs_jax.data.views import cropped, equal_exposure
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_size
-from humangs_jax.io.reading import read_json, reading, walk, write_json
+from humangs_jax.io.reading import read_json, reading, visible, write_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
-MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
 """Names that are looked for in the folder of photos, in this order; those of files: `data.formats`."""
 KEYPOINT_FOLDER = "keypoints"
@@ -53,6 +61,7 @@ class Material:
 
     folder: that was looked at. images: the folder of its photos. photos: their number. size: of the first one, pixels.
     cameras, keypoints: file or folder, masks: folder, None where there is none. alpha: whether photos carry their mask.
+    unused: what the folder has besides.
     """
 
     folder: Path
@@ -63,9 +72,10 @@ class Material:
     masks: Path | None = None
     alpha: bool = False
     keypoints: Path | None = None
+    unused: tuple[Unused, ...] = ()
 
     def __str__(self) -> str:
-        """A line for each kind of thing."""
+        """A line for each kind of thing, and one for what is not used."""
         masks = self.masks or ("in the photos' alpha channel" if self.alpha else None)
         rows = {
             "photos": f"{self.photos} in {self.images}, the first of {self.size[0]} x {self.size[1]} pixels",
@@ -73,7 +83,9 @@ class Material:
             "masks": masks,
             "keypoints": self.keypoints,
         }
-        return "\n".join(f"{name + ':':<11}{'missing' if found is None else found}" for name, found in rows.items())
+        lines = [f"{name + ':':<11}{'missing' if found is None else found}" for name, found in rows.items()]
+        left_out = unused_line(self.unused)
+        return "\n".join([*lines, *([] if left_out is None else [left_out])])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,36 +112,57 @@ def look(folder: Path, *, cameras: Path | None = None, masks: Path | None = None
     for path in (cameras, masks, keypoints):
         if path is not None and not path.exists():
             raise CaptureError(path, "", "no such file or folder")
-    images, photos = photo_files(folder)
+    scan = scan_photos(folder)
+    images, photos = scan.folder, scan.photos
+    mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     named = [folder / KEYPOINT_FOLDER] if (folder / KEYPOINT_FOLDER).exists() else []
     named += [found[1]] if (found := KEYPOINTS.found(folder)) else []
-    others = sorted(path for path in folder.glob("*keypoint*") if path.suffix in ("", ".json", ".npz"))
+    others = sorted(path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz"))
     return Material(
         folder=folder,
         images=images,
         photos=len(photos),
         size=image_size(photos[0]),
         cameras=cameras or next((place for name in CAMERA_PLACES if CAMERAS.found(place := folder / name)), None),
-        masks=masks or next((place for name in MASK_FOLDERS if any(find_photos(place := folder / name))), None),
+        masks=masks or next(iter([*mask_folders, *([images] if scan.masks else [])]), None),
         alpha=is_transparent(photos[0]),
         keypoints=keypoints or next(iter([*named, *others]), None),
+        unused=scan.unused,
     )
 
 
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that the photos are in, and their files in order. Raises: CaptureError, one line, if there is none."""
+    scan = scan_photos(folder)
+    return scan.folder, list(scan.photos)
+
+
+def scan_photos(folder: Path) -> FolderScan:
+    """The photos in a folder, or in the one in it that is called like one of photos, and what both hold besides.
+
+    Raises: CaptureError, one line, if there is no photo.
+    """
     _expect_folder(folder)
-    images = next((place for name in PHOTO_FOLDERS if any(find_photos(place := folder / name))), folder)
-    photos = sorted(find_photos(images))
-    if not photos:
-        raise CaptureError(folder, "", f"no photo: expected {', '.join(PHOTO_SUFFIXES)} files in it or in {folder / 'images'}")
-    return images, photos
+    images = next((place for name in PHOTO_FOLDERS if has_photos(place := folder / name)), folder)
+    whole = _scan(folder)
+    if images == folder:
+        scan = whole
+    else:
+        scan = _scan(images)
+        others = [Unused(photo, ELSEWHERE) for photo in whole.photos if not photo.is_relative_to(images)]
+        others += [each for each in whole.unused if not each.path.is_relative_to(images)]
+        scan = dataclasses.replace(scan, unused=(*scan.unused, *others))
+    if not scan.photos:
+        expected = f"expected {', '.join(PHOTO_SUFFIXES)} files in it or in {folder / 'images'}"
+        left_out = unused_line(scan.unused)
+        raise CaptureError(folder, "", f"no photo: {expected}" + ("" if left_out is None else f" ({left_out})"))
+    return scan
 
 
 def _expect_folder(folder: Path) -> None:
     if not folder.is_dir():
         wrong = "is a file" if folder.exists() else "no such folder"
-        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEOS)})")
+        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEO_SUFFIXES)})")
 
 
 def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:
@@ -173,13 +206,15 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
     return tuple(found)
 
 
-def find_photos(folder: Path) -> Iterator[Path]:
-    """The photos of a folder and of those in it, except for masks, captures, and what other programs have made of photos."""
+def has_photos(folder: Path) -> bool:
+    """Whether there is a photo in a folder or in those in it."""
+    return bool(_scan(folder).photos)
+
+
+def _scan(folder: Path) -> FolderScan:
+    """Without masks, and without what other programs have made of photos."""
     others = (*MASK_FOLDERS, KEYPOINT_FOLDER, *(name for each in KEYPOINTS.values() for name in each.files), "colmap")
-    if folder.is_dir():
-        with reading(folder, "folder of photos", CaptureError):
-            found = walk(folder, lambda path: path.name in others or (path / "capture.json").exists())
-            yield from filter(is_photo, found)
+    return scan_folder(folder, lambda place: place.name in others)
 
 
 # Photos of a video ----------------------------------------------------------------------------------------------------
@@ -195,9 +230,11 @@ def video_of(place: Path) -> Path | None:
     Raises: CaptureError for several videos.
     """
     if not place.is_dir():
-        return place if place.is_file() and place.suffix.lower() in VIDEOS else None
+        return place if place.is_file() and is_video(place) else None
+    if has_photos(place):
+        return None
     videos = find_videos(place)
-    if not videos or next(find_photos(place), None) is not None:
+    if not videos:
         return None
     if len(videos) > 1:
         problem = "expected photos or one video (videos of several cameras: `humangs import cameras`)"

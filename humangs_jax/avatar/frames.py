@@ -26,7 +26,7 @@ from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import add_files
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import DRAWN, write_png
 from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
@@ -372,7 +372,7 @@ def write_splat_views(out: Path, gaussians: Gaussians, cameras: Mapping[str, Cam
 
     def write(folder: Path) -> None:
         for name, image in zip(cameras, splat_images(gaussians, cameras, shot), strict=True):
-            write_png(folder / f"{name}.png", image)
+            write_png(folder / f"{name}.png", image, mark=DRAWN)
 
     add_files(out, write)
     return len(cameras)

@@ -35,7 +35,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files, replace_file
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import DRAWN, write_png
 from humangs_jax.io.reading import limits
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
@@ -125,7 +125,7 @@ def write_views(
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
         views = []
         for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", shown=progress)):
-            write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()))
+            write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()), mark=DRAWN)
             if exr is not None:
                 views.append(exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how))
         if exr is not None:

@@ -19,7 +19,7 @@ from humangs_jax.core.checks import ROUNDING, checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.registry import alternatives
 from humangs_jax.io.atomic import add_files, replace_file
-from humangs_jax.io.images import to_uint8, write_png
+from humangs_jax.io.images import DRAWN, to_uint8, write_png
 
 Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
 CHANNELS = (3, 4)
@@ -120,7 +120,7 @@ def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
 def write_images(folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
     """PNG files of all frames."""
     for i, frame in enumerate(frames):
-        write_png(folder / f"frame_{i:05d}.png", frame)
+        write_png(folder / f"frame_{i:05d}.png", frame, mark=DRAWN)
 
 
 def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
@@ -271,7 +271,7 @@ def contact_sheet(
     columns: int | None = None,
 ) -> None:
     """Write a grid of images as a PNG; see `tile`."""
-    write_png(path, tile(images, labels=labels, headers=headers, columns=columns))
+    write_png(path, tile(images, labels=labels, headers=headers, columns=columns), mark=DRAWN)
 
 
 def side_by_side(
@@ -288,7 +288,8 @@ def side_by_side(
     columns = 3 if len(truth) <= 3 else 6
     texts = None if labels is None else [text for label in labels for text in (label, "", "")]
     sheet = tile(triples, labels=texts, headers=headers * (columns // 3), columns=columns)
-    write_png(path, np.concatenate([sheet, error_legend(sheet.shape[1], _text_height(truth.shape[2]))]))
+    legend = error_legend(sheet.shape[1], _text_height(truth.shape[2]))
+    write_png(path, np.concatenate([sheet, legend]), mark=DRAWN)
 
 
 def tile(

@@ -79,10 +79,13 @@ class Detect:
 
         with stage("finding people"):
             photos = detect.found_in_photos(self.photos)
+            left_out = detect.left_out(self.photos)
         person = detect.choose(photos, self.person, self.out / detect.SHEET_FILE)
         with stage("writing"):
             detect.write_found(self.out, photos, person)
         tell_found(photos, person)
+        if left_out is not None:
+            tell(left_out)
         wrote(self.out / detect.KEYPOINTS_FILE, f"keypoints of the person in {len(photos)} photos")
         wrote(self.out / detect.MASKS, "what of each photo is the person")
         wrote(self.out / detect.SHEET_FILE, "look at it")

@@ -242,7 +242,8 @@ class Start:
                 overwrite=True,
                 also=self._mark(),
             )
-        tell(report)
+        told = {each.path for each in material.unused}
+        tell(dataclasses.replace(report, unused=tuple(each for each in report.unused if each.path not in told)))
         if report.undistorted and material.keypoints is not None:
             warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")
         if report.turned and material.keypoints is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from humangs_jax.core.registry import FOLDER, Format, Formats, imported
+from humangs_jax.io.reading import visible
 
 # Cameras and keypoints --------------------------------------------------------------------------------------------------
 # The module of a row has two functions; where several recognize a file, the first reads it, those of its suffix before others.
@@ -55,6 +56,8 @@ class CameraFormat(SourceFormat):
     """Where the centre of the first pixel is: at (0, 0) or at (0.5, 0.5)."""
     per_image: bool = False
     """Whether it has one camera for each image, not one for each camera."""
+    unit: float | None = None
+    """Metres in its unit of length; None where it may be any."""
 
     def __str__(self) -> str:
         return f"{self.about} ({', '.join(self.names)})" if self.files else self.about
@@ -67,7 +70,7 @@ class SourceFormats(Formats[F]):
         """The first format of which a folder has files, and the first of these; None: none."""
         for each in self.values():
             for pattern in each.files:
-                if (file := next(iter(sorted(folder.glob(pattern))), None)) is not None:
+                if (file := next(iter(sorted(visible(folder.glob(pattern)))), None)) is not None:
                     return each, file
         return None
 
@@ -135,6 +138,7 @@ CAMERAS = SourceFormats(
         _CAMERAS + "rigs:read_panoptic",
         files=("calibration_[0-9]*.json",),
         content="JSON: a list `cameras` of `K`, `distCoef`, `R`, `t`, `resolution`",
+        unit=0.01,
     ),
     opencv=CameraFormat(
         "OpenCV, AvatarReX or THuman4.0",

@@ -50,6 +50,11 @@ EXIF_MARKS = (b"Exif", b"eXIf", b"EXIF", b"ftypavi", b"Raw profile type", b"adob
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
 """Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+MARK_KEY = "Software"
+DRAWN, MASK = "humangs_jax", "humangs_jax mask"
+"""Values of the text `Software` in PNG files: of pictures that show results, which are never photos, and of masks."""
+MARK_HEAD = 1024
+"""Bytes of a PNG file in which the text stands: it is written before the pixels."""
 PALETTE, GREY_AND_ALPHA = 3, 4
 """Color types: of pixels that are numbers of a palette, and of two channels."""
 
@@ -203,23 +208,52 @@ def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
 
 
 def write_png(
-    path: str | Path, image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"], compress_level: int = 6
+    path: str | Path,
+    image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"],
+    compress_level: int = 6,
+    mark: str | None = None,
 ) -> None:
     """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
 
-    A fourth channel is alpha. compress_level: of zlib; 1 takes a third of the time and a sixth more room. The file appears whole
-    or not at all. Raises: OSError if it cannot be written.
+    A fourth channel is alpha. The file appears whole or not at all.
+
+    Arguments: compress_level: of zlib; 1 takes a third of the time and a sixth more room. mark: DRAWN for a picture that shows
+    results and is not to be taken for a photo, MASK for a mask; see `mark_of`. None: a photo.
+    Raises: OSError if it cannot be written.
     """
-    write_bytes(path, png_bytes(image, compress_level))
+    write_bytes(path, png_bytes(image, compress_level, mark))
 
 
-def png_bytes(image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"], compress_level: int = 6) -> bytes:
+def png_bytes(
+    image: Float[np.ndarray, "h w *c"] | UInt8[np.ndarray, "h w *c"], compress_level: int = 6, mark: str | None = None
+) -> bytes:
     """The content of the file that `write_png` writes."""
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
+    texts = PngInfo()
+    if mark is not None:
+        texts.add_text(MARK_KEY, mark)
     file = io.BytesIO()
-    Image.fromarray(to_uint8(image)).save(file, format="PNG", compress_level=compress_level)
+    Image.fromarray(to_uint8(image)).save(file, format="PNG", compress_level=compress_level, pnginfo=texts)
     return file.getvalue()
+
+
+def mark_of(path: str | Path) -> str | None:
+    """The mark with which `write_png` wrote a file; None for other files, and for those that cannot be read."""
+    with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
+        head = file.read(MARK_HEAD)
+        for mark in (DRAWN, MASK):
+            text = f"{MARK_KEY}\0{mark}".encode()
+            chunk = struct.pack(">I", len(text)) + b"tEXt" + text
+            if head.startswith(PNG_SIGNATURE) and chunk in head:
+                return mark
+    return None
+
+
+def is_own_picture(path: str | Path) -> bool:
+    """Whether a file is a picture that shows results: a sheet, a rendering, a texture. Photos and masks are none."""
+    return mark_of(path) == DRAWN
 
 
 def image_row(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:

@@ -18,7 +18,7 @@ import os
 import re
 import reprlib
 import stat
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -269,6 +269,11 @@ def walk(folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda f
                     elif not told:
                         told = True
                         logger.warning("%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE)
+
+
+def visible(paths: Iterable[Path]) -> list[Path]:
+    """Those whose names do not begin with a dot, as `._NAME` of macOS and what is not whole yet."""
+    return [path for path in paths if not path.name.startswith(".")]
 
 
 def check_unpacked(size: int, unpacked: int) -> None:

@@ -35,7 +35,7 @@ from humangs_jax.core.progress import bar, say, stage
 from humangs_jax.data.loading import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer, write_text
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import DRAWN, write_png
 from humangs_jax.io.reading import Refused, parse_json, read_text, reading
 from humangs_jax.losses.loss_networks import NO_NETWORKS, LossNetworks
 from humangs_jax.network.parts import Variables
@@ -366,7 +366,7 @@ def _rehearse(
 
 def _report(log: RunLog, out: Path, done: int, numbers: dict[str, float], image: Float[np.ndarray, "h w 3"]) -> None:
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
-    write_png(out / "sheets" / f"{done:07d}.png", image)
+    write_png(out / "sheets" / f"{done:07d}.png", image, mark=DRAWN)
     log.image(done, "validation/sheet", image)
     why = lambda name, value: f" ({DROPPED[name]})" if value and name in DROPPED else ""
     say(f"step {done}: " + ", ".join(f"{name} {x:.4g}{why(name, x)}" for name, x in numbers.items()))

@@ -29,7 +29,7 @@ from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.atomic import write_text
-from humangs_jax.io.images import png_bytes, write_png
+from humangs_jax.io.images import DRAWN, png_bytes, write_png
 from humangs_jax.io.mesh import INDICES, VERTICES, GlbWriter
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
@@ -270,7 +270,7 @@ def write_poses(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motio
 def write_material(path: Path, mesh: BodyMesh) -> Path:
     """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them. Returns the `.mtl`'s path."""
     texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
-    write_png(texture, mesh.texture.astype(np.float32) / 255)
+    write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
     write_text(material, f"newmtl skin\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture.name}\n")
     return material
 

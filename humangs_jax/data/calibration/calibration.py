@@ -99,6 +99,23 @@ class Calibration:
     stations: int | None = None
     mask_key: str | None = None
     upright: bool = False
+    unit: float | None = None
+    """Metres in the unit of the format, None where it may be any."""
+
+    def with_cameras(self, kept: Sequence[int]) -> "Calibration":
+        """The calibration of these cameras alone, and of what they saw; frames are counted anew."""
+        cameras = [self.cameras[i] for i in kept]
+        frames = {frame: i for i, frame in enumerate(sorted({camera.frame for camera in cameras}))}
+        cameras = [dataclasses.replace(camera, frame=frames[camera.frame]) for camera in cameras]
+        seen = self.observations
+        if seen is not None:
+            new = np.full(len(self.cameras), -1)
+            new[list(kept)] = np.arange(len(kept))
+            own = new[seen.cameras] >= 0
+            seen = Observations(seen.points[own], new[seen.cameras[own]], seen.pixels[own])
+            seen = seen if own.any() else None
+        stations = None if self.stations is None else min(self.stations, len(cameras))
+        return dataclasses.replace(self, cameras=tuple(cameras), observations=seen, stations=stations)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +142,7 @@ class Source:
     ) -> Calibration:
         """These cameras, with what the format means. file: that errors name, `path` if None."""
         what = format.about, file or self.path, tuple(cameras), format.per_image, format.pixel_centers, format.up
-        return Calibration(*what, **more)
+        return Calibration(*what, unit=format.unit, **more)
 
 
 def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibration:
@@ -317,6 +334,10 @@ REPROJECTION_LIMIT = 2.0
 """Pixels; calibrations are usually good to less than one."""
 DISTANCES = (0.3, 30.0)
 """Metres between which cameras stand from a person."""
+UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
+"""Units in which people calibrate."""
+USUAL_DISTANCE = 2.5
+"""Metres from a camera to a person: of several units, the one that comes nearest is likely."""
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
 """Axes within about 2 degrees of each other do not define a point where they meet."""
 MISS = 0.5
@@ -361,6 +382,30 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
     warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][:1]
     count = 0 if converted.observations is None else len(converted.observations.points)
     return Checks(reprojection, count, distance, tuple(warnings))
+
+
+def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
+    """Metres in a unit of a calibration, and a line about it unless it is 1, or said by nothing.
+
+    The format's unit is taken where it has one, else metres. If the cameras then stand too near to a person or too far, it is the
+    unit that puts them there, if one does.
+    """
+    known = calibration.unit or 1.0
+    matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
+    matrices[:, :3, :3] = [nearest_rotation(matrix[:3, :3]) for matrix in matrices]
+    depths, _ = axes_meeting(matrices)
+    distance = None if depths is None else float(np.median(np.abs(depths)))
+    low, high = DISTANCES
+    if distance is None or low <= known * distance <= high:
+        line = f"{calibration.format} is in {UNITS.get(known, 'units of its own')}: taken (--scale says otherwise)"
+        return known, line if known != 1 else None
+    fitting = [unit for unit in UNITS if low <= unit * distance <= high]
+    if not fitting:
+        return known, None
+    best = min(fitting, key=lambda unit: abs(np.log(unit * distance / USUAL_DISTANCE)))
+    before, after = f"{known * distance:.3g} m", f"{best * distance:.3g} m"
+    why = f"in {UNITS.get(known, 'its unit')} the cameras stand {before} from where they look, so {after}"
+    return best, f"the unit is taken for {UNITS[best]}: {why} (--scale says otherwise)"
 
 
 def mean_reprojection_error(calibration: Calibration) -> float | None:

@@ -5,6 +5,7 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
 import dataclasses
+import functools
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,10 +25,12 @@ from humangs_jax.data.calibration.calibration import (
     PixelCenters,
     check_calibration,
     in_capture_convention,
+    likely_unit,
     read_calibration,
     undistort,
 )
 from humangs_jax.data.calibration.photos import (
+    NO_CAMERA,
     Photo,
     Turn,
     check_masks,
@@ -39,9 +42,12 @@ from humangs_jax.data.calibration.photos import (
     photo_size,
     turn_notes,
     turned_cameras,
+    unused_photos,
+    with_photos,
 )
 from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera, counted, few
+from humangs_jax.data.folders import STILL, Unused, scan_folder, unused_line
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
@@ -76,6 +82,8 @@ class ImportReport:
     """Further lines."""
     warnings: tuple[str, ...]
     """Likely mistakes."""
+    unused: tuple[Unused, ...] = ()
+    """What the folder of photos holds besides."""
 
     def __str__(self) -> str:
         photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
@@ -88,7 +96,11 @@ class ImportReport:
             lines.append(f"mean reprojection error: {error:.3g} px ({points})")
         if self.checks.distance is not None:
             lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
-        return "\n".join([*lines, *self.notes, *(f"warning: {warning}" for warning in self.warnings)])
+        lonely = [each for each in self.unused if each.why.because.startswith(NO_CAMERA)]
+        expected = unused_line(each for each in self.unused if each not in lonely)
+        warnings = [line for line in (unused_line(lonely), *self.warnings) if line is not None]
+        lines += [*self.notes, *([] if expected is None else [expected])]
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in warnings)])
 
 
 def import_cameras(
@@ -111,7 +123,7 @@ def import_cameras(
         source: file or folder of any format in docs/cameras.md; its content decides which one.
         images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of their masks, named alike.
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
-        scale: metres per unit of the source; 1 if None.
+        scale: metres per unit of the source; None: the format's unit, else the one that puts the cameras near a person.
         up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
         every, frames: of videos, the frame step and the largest number of frames.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
@@ -122,19 +134,33 @@ def import_cameras(
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
-    scale = 1.0 if scale is None else scale
     _check_options(scale, up, pixel_centers, every, frames)
     for folder in (images, masks):
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
     check_place(out, overwrite, (source, images, masks))
     with photos_of_videos(images, masks, out, every, frames) as found:
-        calibration = read_calibration(source, lambda name: photo_size(photo_of(found.images, name, source)))
+        calibration = read_calibration(source, functools.partial(_size_of, found.images, source))
+        calibration, left_out = with_photos(calibration, found.images)
         report = import_calibration(
             calibration, found.images, out, masks=found.masks, scale=scale, up=up, pixel_centers=pixel_centers, also=also
         )
-    notes, warnings = (*report.notes, *found.notes), (*report.warnings, *found.warnings)
-    return dataclasses.replace(report, notes=notes, warnings=warnings)
+    unused = report.unused
+    if found.images != images:  # frames of videos, which are all used
+        unused = tuple(Unused(photo, STILL) for photo in scan_folder(images).photos)
+    notes = (*report.notes, *found.notes, *([] if left_out is None else [left_out]))
+    return dataclasses.replace(report, unused=unused, notes=notes, warnings=(*report.warnings, *found.warnings))
+
+
+def _size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
+    """Width and height of the photo of that name. A name without photo gets those of another: its camera is left out later."""
+    try:
+        return photo_size(photo_of(images, name, source))
+    except CaptureError:
+        photos = scan_folder(images).photos
+        if not photos:
+            raise
+        return photo_size(photos[0])
 
 
 def import_calibration(
@@ -143,13 +169,16 @@ def import_calibration(
     out: Path,
     *,
     masks: Path | None = None,
-    scale: float = 1.0,
+    scale: float | None = None,
     up: str | None = None,
     pixel_centers: str | None = None,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
     """`import_cameras` of a calibration in memory, which replaces a capture that is there."""
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
+    about_unit = None
+    if scale is None:
+        scale, about_unit = likely_unit(calibration)
     photos = find_photos(calibration, images, masks)
     check_repeats(calibration.file, [photo.image for photo in photos])
     turns = find_turns(calibration, photos)
@@ -166,6 +195,7 @@ def import_calibration(
         notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
     notes += _padding_notes(turns, canvas)
     warnings += about_masks
+    notes += [] if about_unit is None else [about_unit]
     if calibration.mask_key is not None:
         named = f"{calibration.mask_key} of {calibration.file.name}"
         if masks is not None:
@@ -206,11 +236,12 @@ def import_calibration(
         read_as=f"read as: {said}; {up} up; {scale:g} m per unit; pixel centres at {centers}",
         notes=tuple(notes),
         warnings=(*checks.warnings, *warnings),
+        unused=tuple(unused_photos(photos, images, calibration)),
     )
 
 
-def _check_options(scale: float | int, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
-    if not 0 < scale < float("inf"):
+def _check_options(scale: float | None, up: str | None, pixel_centers: str | None, every: int, frames: int | None) -> None:
+    if scale is not None and not 0 < scale < float("inf"):
         raise ArgumentError("scale", f"{scale:g}: expected metres per unit of the source, more than 0")
     for name, word, known in (("up", up, tuple(ROTATION_TO_Y_UP)), ("pixel_centers", pixel_centers, get_args(PixelCenters))):
         if word is not None and word not in known:

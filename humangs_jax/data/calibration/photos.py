@@ -6,8 +6,7 @@ turned photo (OpenCV) is told by its size. No camera sees a mirrored photo: if t
 """
 
 import dataclasses
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -16,10 +15,20 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_path, counted, few
+from humangs_jax.data.folders import (
+    PHOTO_SUFFIXES,
+    SAME_NAME,
+    SYSTEM_FOLDERS,
+    Reason,
+    Unused,
+    is_photo,
+    photo_of_mask,
+    photos_in,
+    scan_folder,
+)
 from humangs_jax.data.photos import read_checked, read_mask
 from humangs_jax.io.images import image_size, open_image, orientation, oriented, read_grey, read_image
 
-PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
 """File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
@@ -35,6 +44,46 @@ class Photo:
     frame: int
     key: str
     """Path relative to the folder of photos with slashes and without suffix."""
+
+
+MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
+"""Folders whose pictures are no photos."""
+NO_CAMERA = "without a camera in"
+"""How the reason begins why a photo is not used."""
+NO_PHOTO_SHOWN = 4
+"""Names of cameras without photos in a line."""
+
+
+def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, str | None]:
+    """The calibration without those cameras that have no photo, and a line about them; None where all have one.
+
+    Raises: CaptureError if no camera has a photo, or if a file that names its images lacks one while other photos are there.
+    """
+    if calibration.per_image:
+        there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
+    else:
+        there = [bool(photos) for photos in _frames_of(calibration, images)]
+    missing = [camera.name for camera, found in zip(calibration.cameras, there, strict=True) if not found]
+    if not missing:
+        return calibration, None
+    if not any(there):
+        _refuse_missing(calibration, images, missing[0])
+    kept = calibration.with_cameras([i for i, found in enumerate(there) if found])
+    if calibration.per_image:
+        unused = unused_photos(find_photos(kept, images, None), images, kept)
+        if any(each.why.because.startswith(NO_CAMERA) for each in unused):
+            _refuse_missing(calibration, images, missing[0])  # their names do not match: which photo is meant?
+    noun = "image" if calibration.per_image else "camera"
+    whole = counted(len(there), noun)
+    line = f"left out, without a photo: {len(missing)} of {whole} of {calibration.file.name} ({few(missing, NO_PHOTO_SHOWN)})"
+    return kept, line
+
+
+def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
+    """Raises: CaptureError."""
+    if calibration.per_image:
+        photo_of(images, name, calibration.file)
+    raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
 
 
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
@@ -54,13 +103,27 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
         found = [(i, calibration.cameras[i].frame, photo) for i, photo in enumerate(owners)]
     else:
         found = _of_cameras(calibration, images)
+    mask_of = _masks_of(masks, images) if masks is not None else lambda photo: None
     named = {} if masks is not None or calibration.mask_key is None else _named_masks(calibration, images)
     photos = []
     for camera, frame, image in sorted(found, key=lambda entry: (entry[1], entry[0])):
         key = image.relative_to(images).with_suffix("").as_posix()
-        mask = named.get(camera) if masks is None else _mask_file(masks, images, image)
+        mask = named.get(camera) if masks is None else mask_of(image)
         photos.append(Photo(image, mask, camera, frame, key))
     return tuple(photos)
+
+
+def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
+    """What the folder of photos holds and an import does not use, but for masks."""
+    used = {file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None}
+    names = {photo.image.with_suffix("") for photo in photos}
+    no_camera = Reason("photo", f"{NO_CAMERA} {calibration.file.name}")
+    scan = scan_folder(images, lambda place: place.name in MASK_FOLDERS)
+    unused = [each for each in scan.unused if each.path.resolve() not in used]
+    for photo in scan.photos:
+        if photo.resolve() not in used:
+            unused.append(Unused(photo, SAME_NAME if photo.with_suffix("") in names else no_camera))
+    return unused
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
@@ -85,12 +148,17 @@ def photo_of(folder: Path, name: str, file: Path) -> Path:
 
     Raises: CaptureError if there is none, and for a link to what is outside of the folder, see `io.reading.inside`.
     """
+    photo = _photo_at(folder, name)
+    if photo is None:
+        raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
+    checked_path(folder, photo.relative_to(folder), folder)
+    return photo
+
+
+def _photo_at(folder: Path, name: str) -> Path | None:
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in (".", "..", "/")]
-    for start in range(len(parts)):
-        if (photo := _any_suffix(folder.joinpath(*parts[start:]))) is not None:
-            checked_path(folder, photo.relative_to(folder), folder)
-            return photo
-    raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {folder}")
+    found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
+    return next((photo for photo in found if photo is not None), None)
 
 
 def _any_suffix(path: Path) -> Path | None:
@@ -101,52 +169,68 @@ def _any_suffix(path: Path) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def is_photo(path: Path) -> bool:
-    """Whether a file is called like a photo."""
-    return path.suffix.lower() in SUFFIXES
-
-
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, of the file's head alone. Raises: CaptureError if it is no image."""
     return read_checked(image_size, path)
 
 
-def _mask_file(masks: Path, images: Path, image: Path) -> Path:
-    """The mask at the same path in the folder of masks (COLMAP: with one more suffix); AvatarReX: in mask/pha beside the photo.
+def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
+    """A function that finds the mask of a photo of `images`: at the same path in the folder of masks.
 
-    AvatarReX has photos and masks in one folder, so that the photo itself can be what is found first.
+    Its name is the photo's, perhaps with one more suffix (COLMAP) or with a word for masks (RealityScan's IMG.jpg.mask.png,
+    Metashape's IMG_mask.png). AvatarReX has it in mask/pha beside the photo; photos and masks are in one folder there, so that
+    the photo itself can be what is found first. The function raises CaptureError where there is none.
     """
-    path = image.relative_to(images)
-    for place in (path, path.parent / "mask" / "pha" / path.name):
-        if (mask := _any_suffix(masks / place)) is not None and not mask.samefile(image):
-            return mask
-    raise CaptureError(masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it")
+    listed: dict[Path, dict[str, Path]] = {}
+
+    def by_words(place: Path) -> Path | None:
+        folder = place.parent
+        if folder not in listed:
+            files = sorted(folder.iterdir()) if folder.is_dir() else []
+            named = [(photo_of_mask(file.name), file) for file in files if is_photo(file) and file.is_file()]
+            listed[folder] = {name.casefold(): file for name, file in named if name is not None}
+        known = listed[folder]
+        return known.get(place.name.casefold()) or known.get(place.stem.casefold())
+
+    def find(image: Path) -> Path:
+        path = image.relative_to(images)
+        for place in (masks / path, masks / path.parent / "mask" / "pha" / path.name):
+            for mask in (_any_suffix(place), by_words(place)):
+                if mask is not None and not mask.samefile(image):
+                    return mask
+        raise CaptureError(masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it")
+
+    return find
 
 
-def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
+def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
+    """Name of the frame -> photo, for each camera, in the first of the layouts of which there is a photo."""
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
-    of_frame = {folder.name: _photos_in(folder) for folder in images.iterdir() if folder.is_dir()}
-    alone = _photos_in(images)
+    of_frame = {folder.name: photos_in(folder) for folder in images.iterdir() if _may_be_frame(folder)}
+    alone = photos_in(images)
     layouts: tuple[list[dict[str, Path]], ...] = (
-        [_photos_in(images / name) for name in names],
+        [photos_in(images / name) for name in names],
         [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names],
         [{"": alone[name]} if name in alone else {} for name in names],
     )
-    frames_of = next((layout for layout in layouts if any(layout)), layouts[-1])
-    for name, photos in zip(names, frames_of, strict=True):
+    return next((layout for layout in layouts if any(layout)), layouts[-1])
+
+
+def _may_be_frame(folder: Path) -> bool:
+    return folder.is_dir() and not folder.name.startswith(".") and folder.name not in (*MASK_FOLDERS, *SYSTEM_FOLDERS)
+
+
+def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, Path]]:
+    frames_of = _frames_of(calibration, images)
+    for camera, photos in zip(calibration.cameras, frames_of, strict=True):
         if not photos:
-            raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
+            _refuse_missing(calibration, images, camera.name)
     numbers = {frame for photos in frames_of for frame in photos}
     order = sorted(numbers, key=lambda f: (int(f), f)) if all(f.isdecimal() for f in numbers) else sorted(numbers)
     frames = {frame: i for i, frame in enumerate(order)}  # 10 after 9
     return [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
-
-
-def _photos_in(folder: Path) -> dict[str, Path]:
-    entries = os.scandir(folder) if folder.is_dir() else ()
-    return {Path(e.name).stem: Path(e.path) for e in entries if is_photo(Path(e.name)) and e.is_file()}
 
 
 # Orientation ----------------------------------------------------------------------------------------------------------
@@ -235,7 +319,7 @@ def _mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int,
 
 def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
     """Reads the mask of a photo, as the photo is shown. Raises: CaptureError if there is none, or one of another size."""
-    file = _mask_file(masks, images, image)
+    file = _masks_of(masks, images)(image)
     flag, stored = read_checked(orientation, image), photo_size(image)
     shown = stored if flag < 5 else stored[::-1]
     return oriented(read_checked(read_grey, file), _mask_flag(file, flag, stored, shown))

@@ -1,6 +1,6 @@
 """Videos -> photos: of synchronised cameras, a folder for each; of one camera, its best frames. By ffmpeg (imageio-ffmpeg).
 
-    CAMERA.mp4 (.mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0, every, 2 every ...
+    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0, every, 2 every ...
 
 All videos of several cameras have to begin at the same moment. Where their rates differ, or one lacks frames, those of one
 moment are found by time (`moments`), and the numbers are those of moments. Masks are videos of the same names.
@@ -26,11 +26,11 @@ import numpy as np
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.data.calibration.moments import Moments, find_moments, nearest, progressions
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.folders import VIDEO_SUFFIXES, is_video, scan_folder
 from humangs_jax.io.color_spaces import Encoding, cube, of_code_points
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
-SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
 CONTAINERS = "mov,matroska,avi,mpegts"
 """Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat, playlists)."""
 LONGEST_SECONDS = 3600
@@ -41,7 +41,7 @@ def find_videos(folder: Path) -> dict[str, Path]:
     """Name of the camera -> its video, of the videos in a folder. Raises: CaptureError for two videos of one camera."""
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+        if is_video(path):
             if path.stem in found:
                 raise CaptureError(path, "", f"camera {path.stem} has {found[path.stem].name} already: expected one video")
             found[path.stem] = path
@@ -77,15 +77,23 @@ def photos_of_videos(
 ) -> Generator[VideoPhotos]:
     """Folders of photos and masks. Those of videos are written beside `place` and removed in the end; others are as given.
 
-    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all.
+    Where photos and videos are in one folder, as a phone stores the clips of Live Photos, the photos are what is meant.
+
+    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all. Who asks for these means the
+    videos.
     Raises: CaptureError naming the video, also if every or most ask something of folders that hold none.
     """
-    videos = {kind: find_videos(folder) for kind, folder in (("images", images), ("masks", masks)) if folder is not None}
+    asked = every != 1 or most is not None
+    given = {"images": images} if masks is None else {"images": images, "masks": masks}
+    if not asked:
+        given = {kind: folder for kind, folder in given.items() if not _has_photos(folder)}
+    videos = {kind: find_videos(folder) for kind, folder in given.items()}
     if not any(videos.values()):
-        if every != 1 or most is not None:
-            raise CaptureError(images, "", f"no video ({', '.join(SUFFIXES)}): frames can be chosen of videos only")
+        if asked:
+            raise CaptureError(images, "", f"no video ({', '.join(VIDEO_SUFFIXES)}): frames can be chosen of videos only")
         yield VideoPhotos(images, masks)
         return
+    videos = {"images": videos.get("images", {})} | ({} if masks is None else {"masks": videos.get("masks", {})})
     if lonely := sorted(set(videos["images"]) ^ set(videos.get("masks", videos["images"]))):
         raise CaptureError(masks or images, lonely[0], "expected a video of photos and one of masks, or folders of both")
     beside = next(folder for folder in place.resolve().parents if folder.is_dir())
@@ -104,7 +112,28 @@ def photos_of_videos(
         notes = [note for path in videos["images"].values() if (note := _color_note(path))]
         notes += [] if moments is None else moments.notes
         warnings = () if moments is None else moments.warnings
-        yield VideoPhotos(own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings)
+        with named_after(own, images), named_after(mattes, masks or images):
+            yield VideoPhotos(own, mattes if "masks" in videos else masks, tuple(dict.fromkeys(notes)), warnings)
+
+
+def _has_photos(folder: Path) -> bool:
+    """Whether a folder or one in it holds a photo."""
+    return bool(scan_folder(folder).photos)
+
+
+@contextlib.contextmanager
+def named_after(temporary: Path, folder: Path) -> Generator[None]:
+    """Errors about a temporary folder name the folder that it was made of, since the temporary one is gone when they are read.
+
+    Raises: CaptureError.
+    """
+    try:
+        yield
+    except ValueError as error:
+        said = str(error)
+        if str(temporary) not in said:
+            raise
+        raise CaptureError("", "", said.replace(str(temporary), str(folder))) from error
 
 
 def _moments(videos: Mapping[str, Path], every: int, most: int | None) -> tuple[Moments | None, float | None]:

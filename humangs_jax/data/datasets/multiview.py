@@ -65,7 +65,7 @@ from humangs_jax.data.datasets.subject import (
 )
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_in, read_grey, read_image
-from humangs_jax.io.reading import Refused, check_limit, limits, open_file, read_text, reading
+from humangs_jax.io.reading import Refused, check_limit, limits, open_file, read_text, reading, visible
 
 PARAMETERS, MISSING = "smpl_params.npz", "missing_img_files.txt"
 ON_PERSON = 128.5 / 255
@@ -246,7 +246,7 @@ def find_subjects(layout: FolderLayout, folder: str | Path) -> tuple[Path, ...]:
 def subfolders(folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1) -> tuple[Path, ...]:
     """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
     folder = Path(folder)
-    below = (path for level in range(depth) for path in folder.glob("*/" * (level + 1)))
+    below = (path for level in range(depth) for path in visible(folder.glob("*/" * (level + 1))))
     return (folder,) if is_one(folder) else tuple(sorted(path for path in below if is_one(path)))
 
 
@@ -317,7 +317,7 @@ GROUPS = ("Camera_5mp", "Camera_12mp")
 
 def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
     """The main files of a folder with main/ and annotations/, sorted; empty if there are none."""
-    return tuple(sorted(Path(folder).glob("main/*.smc")))
+    return tuple(sorted(visible(Path(folder).glob("main/*.smc"))))
 
 
 class Smc:

@@ -16,7 +16,7 @@ from humangs_jax.data.motion import MotionError
 from humangs_jax.data.motion.rules import ORTHONORMAL
 from humangs_jax.data.motion.vectors import hint_for, values_of
 from humangs_jax.io.arrays import ArrayFile, read_npy
-from humangs_jax.io.reading import Refused, check_limit, open_file, read_json
+from humangs_jax.io.reading import Refused, check_limit, open_file, read_json, visible
 from humangs_jax.io.restricted_pickle import as_array, objects
 from humangs_jax.io.tensors import read_values
 
@@ -92,8 +92,9 @@ def _files(folder: Path) -> list[Path]:
     natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
     for place in (folder / name for name in FOLDERS):
         for suffix in (".json", ".npz", *OF_ONE):
-            if files := sorted((file for file in place.glob("*" + suffix) if file.name != "camera.npy"), key=natural):
-                return files
+            files = [file for file in visible(place.glob("*" + suffix)) if file.name != "camera.npy"]
+            if files:
+                return sorted(files, key=natural)
     raise Refused("no .json, .npz or other file of a motion in this folder")
 
 

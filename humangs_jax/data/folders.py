@@ -1,0 +1,189 @@
+"""What a folder holds: the photos that are used, and what is not used, each file with the reason.
+
+Every command that looks for photos asks `scan_folder`, so that all of them take the same files and can say what they leave out.
+Names that begin with a dot are no photos: macOS writes `._IMG_1.jpg` beside `IMG_1.jpg` on disks of other systems.
+"""
+
+import dataclasses
+import os
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from humangs_jax.data.capture_checks import CaptureError, counted, few
+from humangs_jax.io.images import is_own_picture
+from humangs_jax.io.reading import reading, walk
+
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
+"""File types of photos that are read, the likelier original first."""
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".avi")
+"""File types of videos that are read."""
+OTHER_PICTURES = (
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".gif",
+    ".jxl",
+    ".jp2",
+    ".jfif",
+    ".mpo",
+    ".psd",
+    ".tga",
+    ".exr",
+    ".hdr",
+    ".ppm",
+    ".pgm",
+)
+"""Pictures that are not read, but that somebody may take for photos."""
+RAW_PICTURES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+"""What cameras write besides JPEG."""
+OTHER_VIDEOS = (".webm", ".mts", ".m2ts", ".3gp", ".wmv", ".mpg")
+"""Videos that are not read."""
+SYSTEM_FOLDERS = ("__MACOSX", "@eaDir")
+"""Folders of previews, which archives of macOS and disks of Synology have."""
+NAMES_SHOWN = 3
+"""Of each kind of files that are not used."""
+
+_WORDS = "(?:masks?|mattes?|alpha|silhouettes?|seg|segmentation)"
+_MASK_BEHIND = re.compile(rf"(?P<photo>.+?)[._ -]+{_WORDS}", re.IGNORECASE)
+_MASK_BEFORE = re.compile(rf"{_WORDS}[._ -]+(?P<photo>.+)", re.IGNORECASE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reason:
+    """Why files are not used, as in "2 videos beside photos"."""
+
+    noun: str
+    """What they are, singular."""
+    because: str
+    """The rest of the phrase."""
+
+
+CLIP = Reason("video", "beside photos")
+STILL = Reason("photo", "beside the videos whose frames were asked for")
+OTHER_FORMAT = Reason("file", "in a format that is not read")
+OWN = Reason("picture", "that humangs drew")
+ELSEWHERE = Reason("photo", "outside of the folder of photos")
+SAME_NAME = Reason("photo", "with the name of another one")
+MASK = Reason("mask", "beside photos")
+CAPTURE = Reason("folder", "that is a capture already")
+
+
+@dataclasses.dataclass(frozen=True)
+class Unused:
+    """A file that is not used."""
+
+    path: Path
+    why: Reason
+
+
+@dataclasses.dataclass(frozen=True)
+class FolderScan:
+    """The photos in a folder and in the folders in it, and what is not used."""
+
+    folder: Path
+    photos: tuple[Path, ...]
+    """In order."""
+    unused: tuple[Unused, ...] = ()
+    """In order. Files that nobody takes for a photo or a video are not among them."""
+    masks: tuple[Path, ...] = ()
+    """Of the photos in the same folder, where each photo has one; else these are unused."""
+
+
+def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False) -> FolderScan:
+    """The photos of a folder, and what it holds besides.
+
+    Arguments: skip: whether a folder in it is of something else than photos.
+    Raises: CaptureError if the folder cannot be read.
+    """
+    if not folder.is_dir():
+        return FolderScan(folder, ())
+    captures: list[Path] = []
+
+    def skipped(place: Path) -> bool:
+        if place.name in SYSTEM_FOLDERS or skip(place):
+            return True
+        is_capture = (place / "capture.json").exists()
+        captures.extend([place] if is_capture else [])
+        return is_capture
+
+    with reading(folder, "folder of photos", CaptureError):
+        files = sorted(walk(folder, skipped))
+    pictures = [file for file in files if is_photo(file)]
+    unused = [Unused(place, CAPTURE) for place in captures]
+    unused += [Unused(file, OWN) for file in pictures if is_own_picture(file)]
+    own = {each.path for each in unused}
+    pictures = [file for file in pictures if file not in own]
+    masks = masks_beside(pictures)
+    photos = [file for file in pictures if file not in masks]
+    whole = len(set(masks.values())) == len(photos)  # else who knows which of them are meant
+    unused += [] if whole else [Unused(file, MASK) for file in masks]
+    for file in files:
+        suffix = file.suffix.lower()
+        if suffix in VIDEO_SUFFIXES and photos:
+            unused.append(Unused(file, CLIP))
+        elif suffix in OTHER_PICTURES + RAW_PICTURES + OTHER_VIDEOS:
+            unused.append(Unused(file, OTHER_FORMAT))
+    return FolderScan(folder, tuple(photos), tuple(sorted(unused, key=lambda each: each.path)), tuple(masks) if whole else ())
+
+
+def photos_in(folder: Path) -> dict[str, Path]:
+    """Name without suffix -> photo, of the photos that lie in a folder itself.
+
+    Of several photos with one name that of the first of `PHOTO_SUFFIXES` is taken.
+    """
+    if not folder.is_dir():
+        return {}
+    with os.scandir(folder) as entries:
+        files = [Path(entry.path) for entry in entries if is_photo(Path(entry.name)) and entry.is_file()]
+    files = [file for file in files if not is_own_picture(file)]
+    beside = masks_beside(files)
+    photos = [file for file in files if file not in beside]
+    preferred = sorted(photos, key=lambda file: (PHOTO_SUFFIXES.index(file.suffix.lower()), file.name), reverse=True)
+    return {file.stem: file for file in preferred}
+
+
+def is_photo(path: Path) -> bool:
+    """Whether a file is called like a photo."""
+    return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is called like a video."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
+
+
+def photo_of_mask(name: str) -> str | None:
+    """The name of the photo that the name of a mask tells, perhaps without suffix; None if it does not say "mask".
+
+    "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of "1".
+    """
+    stem = Path(name).stem
+    found = _MASK_BEHIND.fullmatch(stem) or _MASK_BEFORE.fullmatch(stem)
+    return None if found is None else found["photo"]
+
+
+def masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
+    """Mask -> photo, of pictures that are called like the mask of another one in the same folder."""
+    pictures = list(pictures)
+    named: dict[tuple[Path, str], Path] = {}
+    for file in pictures:
+        for name in (file.stem, file.name):
+            named[file.parent, name.casefold()] = file
+    masks = {}
+    for file in pictures:
+        photo = photo_of_mask(file.name)
+        if photo is not None and (file.parent, photo.casefold()) in named:
+            masks[file] = named[file.parent, photo.casefold()]
+    return masks
+
+
+def unused_line(unused: Iterable[Unused]) -> str | None:
+    """What is not used, with numbers, reasons and the first names, in one line; None for nothing."""
+    groups: dict[Reason, list[str]] = {}
+    for each in unused:
+        groups.setdefault(each.why, []).append(each.path.name)
+    if not groups:
+        return None
+    parts = [f"{counted(len(names), why.noun)} {why.because} ({few(names, NAMES_SHOWN)})" for why, names in groups.items()]
+    return f"not used: {'; '.join(parts)}"
