@@ -222,12 +222,13 @@ def require_folder(path: Path, option: str = "--out") -> None:
 
 def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()) -> None:
     """A folder of the kind that holds the file `mark` can be made there, or replaced with --overwrite. Raises: UsageError."""
-    from humangs_jax.io.atomic import check_replaceable
+    from humangs_jax.io.atomic import check_replaceable, remove_abandoned_lock
 
     require_folder(folder)
     try:
         check_replaceable(folder, overwrite, mark, inputs)
     except ValueError as error:
+        remove_abandoned_lock(folder)  # a killed run may have left it after its last file
         raise UsageError(f"--out {error}") from error
 
 

@@ -281,10 +281,24 @@ def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Ge
         with _locked(folder, wait=False):
             yield
         return
-    lock = folder.absolute().with_name(f".{folder.absolute().name}.lock")
+    lock = _lock_of(folder)
     lock.parent.mkdir(parents=True, exist_ok=True)
     with _locked(folder, wait=False, lock=lock), _unfinished(lock):
         yield
+
+
+def remove_abandoned_lock(folder: str | os.PathLike[str]) -> None:
+    """Remove the lock that a killed process left beside a folder; one that a process holds stays."""
+    lock = _lock_of(Path(folder))
+    if not lock.is_file():
+        return
+    with contextlib.suppress(OSError), _locked(Path(folder), wait=False, lock=lock):
+        _remove(lock)
+
+
+def _lock_of(folder: Path) -> Path:
+    """The file beside a folder that `only_writer(replaced=True)` locks."""
+    return folder.absolute().with_name(f".{folder.absolute().name}.lock")
 
 
 @contextlib.contextmanager

@@ -383,3 +383,14 @@ def test_the_file_that_is_to_be_last_is_moved_last(tmp_path, monkeypatch):
     write = lambda folder: (folder.mkdir(exist_ok=True), [(folder / name).touch() for name in names])
     atomic.add_files(tmp_path / "me", write, last="body.npz")
     assert moved == ["a.json", "c.json", "body.npz"]
+
+
+def test_a_lock_that_nobody_holds_is_removed(tmp_path):
+    lock = tmp_path / ".me.lock"
+    lock.touch()
+    atomic.remove_abandoned_lock(tmp_path / "me")
+    assert not lock.exists()
+    with atomic.only_writer(tmp_path / "me", replaced=True):
+        atomic.remove_abandoned_lock(tmp_path / "me")
+        assert lock.exists()
+    atomic.remove_abandoned_lock(tmp_path / "me")
