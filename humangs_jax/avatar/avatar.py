@@ -24,7 +24,7 @@ from humangs_jax.io.arrays import (
     read_npz,
     write_npz,
 )
-from humangs_jax.io.reading import FileError, Refused, parse_json, reading
+from humangs_jax.io.reading import FileError, Refused, is_unread, parse_json, reading
 from humangs_jax.rendering.gaussians import Gaussians, check_count
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
@@ -253,6 +253,8 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
         arrays, _ = read_npz(path)
         header = parse_json(str(arrays["header"]))
     except (FileError, KeyError) as error:
+        if is_unread(error):
+            raise
         raise FileError(path, "", f"not an avatar file written by humangs ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != VERSION:
         found = header if isinstance(header, dict) else {}

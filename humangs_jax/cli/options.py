@@ -51,6 +51,8 @@ class PartOfMotion:
 
     motion_fps: Annotated[float | None, Range(0.01, 1000.0)] = None
     """Frames per second of the motion, where its file says none. Default: those of the file."""
+    motion_up: Literal["y", "-y", "z", "-z", "x", "-x"] | None = None
+    """The axis that points up in the motion's world, like --motion-up=z. Default: the file's, or as people stand."""
     person: int | None = None
     """Number of the person, in a motion of several people."""
     clip: str | None = None
@@ -58,7 +60,11 @@ class PartOfMotion:
 
     def options(self, path: Path | None) -> tuple[str | Path, ...]:
         """What another command says to play the same; of a file, or nothing."""
-        said = [part for name, value in vars(self).items() if value is not None for part in (option_of(name), str(value))]
+        said: list[str] = []
+        for name, value in vars(self).items():
+            if value is not None:  # what begins with a dash would be taken for an option
+                text = str(value)
+                said += [f"{option_of(name)}={text}"] if text.startswith("-") else [option_of(name), text]
         return () if path is None else ("--motion", path, *said)
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
@@ -67,7 +73,8 @@ class PartOfMotion:
 
         if path is None and (said := [name for name, value in vars(self).items() if value is not None]):
             raise UsageError(f"{option_of(said[0])}: expected --motion with it")
-        return load_motion(path, fps=self.motion_fps, person=self.person, clip=self.clip, rest_joints=rest_joints)
+        up = self.motion_up or "auto"
+        return load_motion(path, up=up, fps=self.motion_fps, person=self.person, clip=self.clip, rest_joints=rest_joints)
 
 
 WHOLE = PartOfMotion()
@@ -186,6 +193,8 @@ def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = 
         try:
             with zipfile.ZipFile(path) as archive:
                 mine = {"header.npy", "skinning_weights.npy"} <= set(archive.namelist())
+        except PermissionError:
+            raise UsageError(f"{option} {path}: exists, and there is no permission to read it") from None
         except (zipfile.BadZipFile, OSError):
             mine = False
         if not mine:

@@ -33,6 +33,7 @@ ENVIRONMENT = "HUMANGS_LIMITS"
 OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """No path in a file needs these."""
+NO_PERMISSION = "no permission to read it"
 LONGEST_LINE, LONGEST_REASON = 1000, 300
 """Characters of an error, in which values of files are quoted, and of what a library says."""
 
@@ -166,6 +167,11 @@ class FileError(ValueError):
         super().__init__(_one_line(": ".join(parts)))
 
 
+def is_unread(error: BaseException) -> bool:
+    """Whether there was no permission to read a file, so that nothing is known of what is in it."""
+    return isinstance(error.__cause__, PermissionError)
+
+
 class Refused(ValueError):
     """What is wrong with the file that is being read, said by a function that does not know its name."""
 
@@ -188,6 +194,8 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
         raise (FileNotFoundError(missing) if raises is FileError else raises("", "", missing)) from error
     except Refused as error:
         raise raises(path, "", error) from error
+    except PermissionError as error:
+        raise raises(error.filename or path, "", NO_PERMISSION) from error
     except Exception as error:  # readers of damaged files raise some twenty types
         named = str(path) and str(error).startswith(f"{path}: ")
         raise raises("" if named else path, "", str(error) if named else _why(kind, error)) from error

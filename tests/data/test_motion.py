@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody, joint_transforms
 from humangs_jax.cli import animate
+from humangs_jax.cli.options import PartOfMotion
 from humangs_jax.data.formats import MOTIONS, MotionFormat
 from humangs_jax.data.motion import PELVIS, Motion, MotionError, Poses, grounded, load_motion, save_motion
 from humangs_jax.geometry import quaternion
@@ -158,13 +159,44 @@ def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
     motion = load_motion(write(tmp_path / "a.npz", **amass(*still)))
     assert motion.rotations[0, 0, 0] == pytest.approx(-np.pi / 2)
     (line,) = caplog.messages
-    assert line == f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; if they should stand: up=y"
+    assert line.startswith(f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; ")
+    assert line.endswith("if they should stand: --motion-up=y (in Python up='y')")
     caplog.clear()
     beat = amass(*still) | {"expressions": np.zeros((4, 100))}  # BEAT2's has y up
     assert not np.any(load_motion(write(tmp_path / "b.npz", **beat)).rotations) and not caplog.messages
     camera = parts(*in_world(*still, UP["-y"]))  # estimators: y points down
     np.testing.assert_allclose(load_motion(write(tmp_path / "c.npz", **camera)).rotations, 0, atol=FLOAT32)
     assert "c.npz: -y is up, not y: people stand along it" in caplog.text
+
+
+def test_a_person_who_stands_still_may_be_turned_by_hand(tmp_path):
+    still = np.zeros((4, 55, 3)), np.zeros((4, 3))
+    file = write(tmp_path / "a.npz", **amass(*still))
+    np.testing.assert_allclose(PartOfMotion(motion_up="y").load(file).rotations, 0, atol=FLOAT32)
+    assert PartOfMotion(motion_up="-z", person=1).options(file) == ("--motion", file, "--motion-up=-z", "--person", "1")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"poses": np.zeros((4, 165)), "trans": np.zeros((4, 3))}, r"framerate: missing: .* --motion-fps \(in Python fps="),
+        (
+            {"header": "{}", "means": np.zeros((3, 3)), "skinning_weights": np.zeros((3, 2))},
+            "motion: this is an avatar: expected",
+        ),
+        ({"points": np.zeros((1, 2)), "confidences": np.zeros(1), "set": "coco17"}, "no motion: these are keypoints"),
+    ],
+)
+def test_what_is_missing_or_no_motion_names_what_to_do(arrays, message, tmp_path):
+    with pytest.raises(MotionError, match=message):
+        load_motion(write(tmp_path / "a.npz", **arrays))
+
+
+@pytest.mark.parametrize(("name", "message"), [("a.mp4", "a video: GV"), ("a.MOV", "a video"), ("a.fbx", "open it in Blender")])
+def test_files_of_other_kinds_say_how_a_motion_comes_of_them(name, message, tmp_path):
+    (tmp_path / name).write_bytes(b"something")
+    with pytest.raises(MotionError, match=f"{name}: no motion: expected a file .*, got .*{message}"):
+        load_motion(tmp_path / name)
 
 
 def test_a_tilt_is_no_other_axis(tmp_path):

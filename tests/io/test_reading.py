@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import errno
 import json
 import re
 import struct
@@ -17,8 +18,13 @@ import pytest
 import trimesh
 from PIL import Image
 
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.export.gaussians import load_gaussians
+from humangs_jax.data.keypoints.reading import read_detections
+from humangs_jax.data.motion import load_motion
 from humangs_jax.io import reading as module
 from humangs_jax.io.arrays import read_npz
+from humangs_jax.io.images import read_image
 from humangs_jax.io.mesh import GREY, read_meshes
 from humangs_jax.io.reading import (
     FileError,
@@ -267,3 +273,20 @@ def test_a_glb_that_requires_an_unknown_extension_is_refused_by_its_name(tmp_pat
 def test_a_glb_whose_extensions_leave_the_shape_alone_is_read(tmp_path):
     (mesh,) = read_meshes(glb_that_requires(tmp_path / "box.glb", "KHR_materials_unlit"))
     assert len(mesh.faces) == 12
+
+
+def test_a_file_without_permission_says_that_and_not_what_is_in_it(tmp_path, monkeypatch):
+    """At every door: an error of the contents would be wrong."""
+
+    def refuse(path, *arguments, **options):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    doors = {"a.npz": Avatar.load, "b.npz": load_motion, "c.ply": load_gaussians, "d.json": read_detections}
+    doors |= {"e.json": read_json, "f.bvh": load_motion, "g.png": read_image}
+    for name in doors:
+        (tmp_path / name).write_bytes(b"PK")
+    monkeypatch.setattr("builtins.open", refuse)
+    for name, read in doors.items():
+        with pytest.raises(FileError) as error:
+            read(tmp_path / name)
+        assert str(error.value) == f"{tmp_path / name}: no permission to read it"

@@ -34,6 +34,14 @@ __all__ = ["PELVIS", "UPRIGHT", "Motion", "MotionError", "grounded", "load_motio
 
 logger = logging.getLogger(__name__)
 WALK = "walk.npz"
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif")
+_OF_A_VIDEO = ", a video: GVHMR, WHAM or TRAM find the motion of the person in it, and their files are read (docs/motions.md)"
+OTHERS = {
+    **dict.fromkeys(VIDEOS, _OF_A_VIDEO),
+    ".fbx": ": open it in Blender and export a .bvh or .glb",
+    ".c3d": ", markers without a skeleton: solve them with the program that recorded them, and export a .bvh",
+}
+"""What else is said of files that are not read, by suffix."""
 SLOWEST = 0.01
 """Frames per second: one in more than a minute and a half is no motion."""
 
@@ -223,7 +231,8 @@ def _reader(path: Path) -> MotionFormat:
             found = MOTIONS["humangs"] if file.read(2) == b"PK" else None
     if found is None:
         got = path.suffix or "no suffix"
-        raise MotionError(path, "", f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}")
+        hint = OTHERS.get(path.suffix.lower(), "")
+        raise MotionError(path, "", f"no motion: expected a file {alternatives(MOTIONS.suffixes)}, got {got}{hint}")
     return found
 
 

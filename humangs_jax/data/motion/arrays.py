@@ -26,6 +26,7 @@ from humangs_jax.io.tensors import read_values
 HEAD = JOINT_NAMES.index("head")
 Rotations = Float[np.ndarray, "m n 3"]
 """Axis-angles of the frames."""
+NO_RATE_AT_ALL = "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
 SOMA_JOINTS = 77
 """Of Kimodo's skeleton that is not SMPL-X's."""
 NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
@@ -60,7 +61,7 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
     counted += ", ..." if len(people) > SHOWN else ""
     if number is not None:
         raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}")
-    raise MotionError(path, "", f"{len(people)} people: {counted}: expected person, the number of one of them")
+    raise MotionError(path, "", f"{len(people)} people: {counted}: expected --person (in Python person=), the number of one")
 
 
 def _frames(person: Person) -> int:
@@ -223,9 +224,9 @@ class _MotionFile(ArrayFile):
                 raise MotionError(self.path, key, f"expected a positive number of frames per second, got {rate}")
             return rate
         if form.fps is None:
-            raise MotionError(self.path, key, "missing: how many frames are a second? expected fps, or this key")
+            raise MotionError(self.path, key, NO_RATE_AT_ALL)
         if not form.fixed:
-            self.said.append(f"{NO_RATE.format(form.fps)}, which fps= changes")
+            self.said.append(f"{NO_RATE.format(form.fps)}, which --motion-fps (in Python fps=) changes")
         return form.fps
 
 

@@ -32,6 +32,11 @@ FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Where the files of a folder may lie."""
 OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
 """Suffixes of files of one person each; others are of one frame each."""
+OTHER_FILES = {
+    "this is an avatar: expected a motion to play with it": {"header", "skinning_weights", "means"},
+    "these are keypoints, which `humangs fit` makes poses of": {"points", "confidences", "set"},
+}
+"""What other files of ours are, by keys that they have."""
 DEEPEST, SHOWN = 6, 12
 NEARLY_ORTHONORMAL = 0.1
 """3 x 3 matrices this close to rotations are those of one person, not vectors of three people; `ORTHONORMAL` is checked later."""
@@ -255,6 +260,9 @@ MORE = ("cam2world", "pred_global_rots")
 
 def expected(values: Mapping[Any, Any]) -> str:
     """What is said of a file of no format."""
+    for what, needed in OTHER_FILES.items():
+        if needed <= values.keys():
+            return f"no motion: {what}"
     first_keys = dict.fromkeys(row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None)
     first = ", ".join(key for key in first_keys if not key.startswith("("))  # that of a single array
     keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"

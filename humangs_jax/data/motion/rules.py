@@ -194,7 +194,8 @@ def up_axis(
         return stands, f"{stands} is up, not {usual}: people stand along it"
     if contradicted or _opposite(stands, usual):
         return usual, ""
-    return (usual, f"{usual} is up, as usual in such files, and people lie along {stands}; if they should stand: up={stands}")
+    lying = f"{usual} is up, as usual in such files, and people lie along {stands}"
+    return usual, f"{lying}; if they should stand: --motion-up={stands} (in Python up={stands!r})"
 
 
 def _floors(points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int) -> list[float]:
