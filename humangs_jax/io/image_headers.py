@@ -15,8 +15,8 @@ MARKED_BRANDS = 16
 """Brands of a box `ftyp` that are looked at; files have up to ten."""
 
 JPEG_START = b"\xff\xd8"
-JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff])")
-"""Any number of FF before the code; FF 00 is a byte FF of the compressed data."""
+JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
+"""FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of others."""
 END, SCAN = 0xD9, 0xDA
 WITH_LENGTH = frozenset((*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE))
 """Markers that two bytes of length follow, as libjpeg reads them; all others stand alone, or libjpeg ends there."""

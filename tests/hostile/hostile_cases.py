@@ -178,6 +178,7 @@ def all_cases() -> list[Case]:
     import attacks_arrays  # noqa: F401
     import attacks_binary  # noqa: F401
     import attacks_paths  # noqa: F401
+    import attacks_photos  # noqa: F401
     import attacks_pickles  # noqa: F401
     import attacks_text  # noqa: F401
 

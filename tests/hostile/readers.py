@@ -44,7 +44,7 @@ from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.fitting.files import read_fit_record
 from humangs_jax.fitting.scan_files import read_joints, read_mesh, read_placement
 from humangs_jax.io.arrays import read_npz
-from humangs_jax.io.images import check_image, image_size, read_grey, read_image
+from humangs_jax.io.images import check_image, cropped_from, focal_length, image_size, orientation, read_grey, read_image
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensors import read_tensors
@@ -70,7 +70,8 @@ class Format(NamedTuple):
 
 
 def read_image_in_every_way(path):
-    return image_size(path), check_image(path), read_image(path)
+    said = orientation(path), focal_length(path), cropped_from(path)
+    return image_size(path), check_image(path), read_image(path), said
 
 
 def read_whole_pickle(path):
