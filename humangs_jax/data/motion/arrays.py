@@ -61,7 +61,7 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
     counted += ", ..." if len(people) > SHOWN else ""
     if number is not None:
         raise MotionError(path, f"person {number}", f"no such person: expected one of {counted}")
-    raise MotionError(path, "", f"{len(people)} people: {counted}: expected --person (in Python person=), the number of one")
+    raise MotionError(path, "", f"{len(people)} people: {counted}: expected the option or argument person, the number of one")
 
 
 def _frames(person: Person) -> int:

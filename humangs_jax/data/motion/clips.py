@@ -192,7 +192,7 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
     listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
     if clip is None:
-        said = f"{len(names)} animations ({listed}): the first is taken; --clip (in Python clip=) takes another"
+        said = f"{len(names)} animations ({listed}): the first is taken; the option or argument clip takes another"
         return animations[0], said if len(names) > 1 else ""
     plain = [name.casefold() for name in names]
     if clip.casefold() in plain:
