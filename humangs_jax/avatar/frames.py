@@ -341,9 +341,9 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN) if len(means) else 1.0
     if len(means):
         low, high = np.quantile(means, [1 - NEARLY_ALL, NEARLY_ALL], axis=0)
-        whole = np.linalg.norm(means - (low + high) / 2, axis=1)
-        if np.quantile(whole, NEARLY_ALL) < COMPACT * radius:
-            middle, radius = (low + high) / 2, np.quantile(whole, NEARLY_ALL)
+        whole = np.quantile(np.linalg.norm(means - (low + high) / 2, axis=1), NEARLY_ALL)
+        if whole < COMPACT * radius:
+            middle, radius = (low + high) / 2, max(radius, whole)
     distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
     turn = up_matrix(up)  # the file's world from one with y up
     cameras = orbit(
