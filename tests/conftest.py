@@ -5,7 +5,7 @@ Environment variables:
 JAX_COMPILATION_CACHE_DIR: where compiled programs are kept; default `cache_folder()`.
 HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
 JAX_DISABLE_MOST_OPTIMIZATIONS: default 1: most of the time of a run is compilation; 0: as users compile.
-HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `compiler_options.CPU_COMPILER_OPTIONS` (wide vectors).
+HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `processes.CPU_COMPILER_OPTIONS` (wide vectors).
 """
 
 import contextlib

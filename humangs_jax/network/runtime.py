@@ -123,7 +123,7 @@ class Conventions:
     """Other poses are drawn in the light of the photos (`Avatar.light`)."""
     low_pass: Length | None = None
     """Metres that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
-    (`avatar.low_pass`); None: it stays with the renderer."""
+    (`Gaussians.low_pass`); None: it stays with the renderer."""
     body_vertices: Vertices | None = knob(
         None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
     )

@@ -216,7 +216,7 @@ def build_bank(
     processes: int = 1,
     progress: bool = False,
 ) -> PeopleBank:
-    """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
+    """The people of some seeds, which must all lie in the range `split` of `subject.SPLITS`.
 
     texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
     displaced: the body to displace, one of `data.views.gaussian_body`; None: none.

@@ -2,7 +2,7 @@
 
 A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
 person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
-`rendering.render_view`: colors come from baked textures, normals are skinned, vertices follow a few joints each.
+`subject.render_view`: colors come from baked textures, normals are skinned, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
@@ -337,7 +337,7 @@ MakeExample = Callable[[Key, int], Example]
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedSource:
-    """Examples that `make` computes from keys; all keys are of people of one split (`seeds.SPLITS`).
+    """Examples that `make` computes from keys; all keys are of people of one split (`subject.SPLITS`).
 
     make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see `ViewSampling`.
     on_host: bring the arrays to the host, where they mix with those of files and are divided among devices.

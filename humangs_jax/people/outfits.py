@@ -2,7 +2,7 @@
 
 Lengths are in template coordinates (see `anatomy`): heights y for hems, |x| for the ends of sleeves. The tables below hold
 specifications of random numbers, see `drawn`. All rows of a table are drawn, whichever is used: a new row changes what every
-seed makes, so raise `seeds.GENERATOR_VERSION` with it.
+seed makes, so raise `subject.GENERATOR_VERSION` with it.
 """
 
 import dataclasses

@@ -91,7 +91,7 @@ class SplatConfig:
         None, cost="pairs beyond it are not drawn, counted and reported", gain="memory, one compilation", measured=MEASURED
     )
     """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and
-    takes `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
+    takes `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and `plan_buffers`
     measures a capacity for such calls."""
     max_rows: Slots | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
     """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""

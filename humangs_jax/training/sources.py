@@ -102,7 +102,7 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, e
 
 
 def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) -> MakeSource:
-    """Several of these, each with its share of the examples, see `loader.Mixture`."""
+    """Several of these, each with its share of the examples, see `examples.Mixture`."""
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
