@@ -21,11 +21,21 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.folders import unused_line
-from humangs_jax.data.keypoints.formats import ImagePeople, seen_person, write_people
+from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, write_people
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import box_of
 from humangs_jax.data.photos import Photos, load_photos, read_description
-from humangs_jax.detection.people import LANDMARK_SIZE, SEEN, DetectedPerson, Networks, detect_people, sharpened
+from humangs_jax.detection.people import (
+    LANDMARK_SIZE,
+    SEEN,
+    Landmarks,
+    Networks,
+    filter_margin,
+    find_people,
+    mask_in_window,
+    mask_window,
+    sharpened,
+)
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import MASK, orientation, oriented, read_image, resized, to_uint8, write_png
 from humangs_jax.io.reading import write_json
@@ -63,8 +73,12 @@ def left_out(folder: Path) -> str | None:
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
     """The same for the photos of a capture folder; their names are the views'. Raises: see `found_in_photos`."""
     photos = load_photos(folder)  # checked; these are on white where there are masks
-    views = read_description(folder / "capture.json")["views"]
-    found = detect_photos([f"{name}.png" for name in photos.names], (read_image(folder / view["image"])[0] for view in views))
+    if photos.masks is None:
+        pictures = iter(photos.images)
+    else:
+        views = read_description(folder / "capture.json")["views"]
+        pictures = (read_image(folder / view["image"])[0] for view in views)
+    found = detect_photos([f"{name}.png" for name in photos.names], pictures)
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
@@ -162,7 +176,7 @@ def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 
     found = []
     for name, each in zip(names, bar(photos, desc="finding people", unit="photo", total=len(names)), strict=True):
         photo = np.ascontiguousarray(each, np.float32)
-        people = sorted((_found(person, photo) for person in detect_people(networks, photo)), key=lambda one: -one.area)
+        people = sorted((_found(person, photo) for person in find_people(networks, photo)), key=lambda one: -one.area)
         height, width = photo.shape[:2]
         shrink = min(1.0, THUMBNAIL / max(height, width))
         small = resized(photo, max(1, round(width * shrink)), max(1, round(height * shrink)))
@@ -170,11 +184,17 @@ def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 
     return found
 
 
-def _found(person: DetectedPerson, photo: Float[np.ndarray, "h w 3"]) -> Found:
-    mask = sharpened(person.mask, photo, person.side / LANDMARK_SIZE)
+def _found(person: Landmarks, photo: Float[np.ndarray, "h w 3"]) -> Found:
+    """The person with a mask whose edges are the photo's. Nothing of the size of the photo is made."""
+    pixel = person.crop.side / LANDMARK_SIZE
+    window = mask_window(person, photo.shape[1], photo.shape[0], filter_margin(pixel))
+    mask = sharpened(mask_in_window(person, window), photo[window], pixel)
     (top, bottom), (left, right) = box_of(mask > 0).tolist()
     cut = to_uint8(mask[top:bottom, left:right])
-    return Found(seen_person(person), cut, (top, left), float((cut > 255 * SEEN).sum()))
+    corner = (window[0].start + top, window[1].start + left)
+    # the first pixel's centre is at 0 for the network, and at one half here
+    points = np.column_stack([person.pixels + 0.5, person.visibility]).astype(np.float64)
+    return Found(SeenPerson(points, person.world, person.presence), cut, corner, float((cut > 255 * SEEN).sum()))
 
 
 # Who is meant -------------------------------------------------------------------------------------------------------

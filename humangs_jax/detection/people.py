@@ -217,23 +217,40 @@ def mask_at(found: Landmarks, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndar
 
 def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray, "height width"]:
     """The mask of a crop at the size of the photo; 0 outside of the crop."""
+    mask = np.zeros((height, width), np.float32)
+    window = mask_window(found, width, height)
+    mask[window] = mask_in_window(found, window)
+    return mask
+
+
+Window = tuple[slice, slice]
+"""Rows and columns of a photo."""
+
+
+def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
+    """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be empty."""
+    corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
+    left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
+    right, bottom = (np.ceil(corners.max(0) + 1).astype(int) + margin).clip(0, [width, height]).tolist()
+    return slice(top, max(bottom, top)), slice(left, max(right, left))
+
+
+def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]:
+    """The mask of a crop at the pixels of a part of the photo; 0 outside of the crop."""
     from PIL import Image
 
-    mask = np.zeros((height, width), np.float32)
-    corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
-    left, top = np.floor(corners.min(0)).astype(int).clip(0, [width, height])
-    right, bottom = np.ceil(corners.max(0) + 1).astype(int).clip(0, [width, height])
-    if right > left and bottom > top:
-        corners = np.asarray([[0.0, 0], [1, 0], [0, 1]]) + np.asarray([left, top])
-        origin, right_of, below = found.crop.from_photo(corners) * LANDMARK_SIZE
-        across, down = right_of - origin, below - origin
-        # Pillow counts from corners of pixels and adds the half pixel of the target itself; it is ten times faster than numpy
-        start = origin + 0.5 - (across + down) / 2
-        affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
-        size = (int(right - left), int(bottom - top))
-        picture = Image.fromarray(found.mask.astype(np.float32))
-        mask[top:bottom, left:right] = picture.transform(size, Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR)
-    return mask
+    rows, columns = window
+    width, height = columns.stop - columns.start, rows.stop - rows.start
+    if not (width and height):
+        return np.zeros((height, width), np.float32)
+    corners = np.asarray([[0.0, 0], [1, 0], [0, 1]]) + np.asarray([columns.start, rows.start])
+    origin, right_of, below = found.crop.from_photo(corners) * LANDMARK_SIZE
+    across, down = right_of - origin, below - origin
+    # Pillow counts from corners of pixels and adds the half pixel of the target itself; it is ten times faster than numpy
+    start = origin + 0.5 - (across + down) / 2
+    affine = tuple(np.stack([across, down, start], axis=-1).ravel().tolist())
+    picture = Image.fromarray(found.mask.astype(np.float32))
+    return np.array(picture.transform((width, height), Image.Transform.AFFINE, affine, Image.Resampling.BILINEAR))
 
 
 @functools.cache
@@ -331,13 +348,19 @@ class DetectedPerson(NamedTuple):
 def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[DetectedPerson]:
     """The people of a photo with values in [0, 1], the largest first."""
     height, width = photo.shape[:2]
-    longest = max(height, width)
+    found = find_people(networks, photo)
+    return [DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side) for p in found]
+
+
+def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
+    """The same with masks of the crops alone: photos of many megapixels have one of hundreds of megabytes for each person."""
+    longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SHARES)
     found = _people(networks, photo, detections)
     if not any(person.crop.side >= LARGE * longest for person in found):
         smaller = window_detections(networks, photo, SMALL_SHARES)
         found = _people(networks, photo, detections + smaller) if smaller else found
-    return [DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side) for p in found]
+    return found
 
 
 def _people(networks: Networks, photo: Float[np.ndarray, "h w 3"], detections: list[Detection]) -> list[Landmarks]:
@@ -440,7 +463,7 @@ def sharpened(mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"],
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
         return mask
-    margin = int(np.ceil(2 * RADIUS * pixel))
+    margin = filter_margin(pixel)
     window = tuple(slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns))
     guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
     height, width = own.shape
@@ -448,11 +471,17 @@ def sharpened(mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"],
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small = (resized(guide, *size), resized(own, *size)) if reduced < 1 else (guide, own)
     slopes, offsets = _affine(*small, max(1, round(RADIUS * reduced * pixel)))
-    if reduced < 1:
-        slopes, offsets = resized(slopes, width, height), resized(offsets, width, height)
-    found, result = np.sum(slopes * guide, axis=-1) + offsets, np.zeros_like(mask)
+    back = (lambda values: resized(values, width, height)) if reduced < 1 else (lambda values: values)
+    found, result = back(offsets).copy(), np.zeros_like(mask)
+    for color in range(3):  # one at a time: all together take gigabytes of a large photo
+        found += back(slopes[..., color]) * guide[..., color]
     result[window] = np.clip(STEEPER * (found - 0.5) + 0.5, 0, 1)
     return result
+
+
+def filter_margin(pixel: float) -> int:
+    """Returns how many pixels around a mask `sharpened` looks at."""
+    return int(np.ceil(2 * RADIUS * pixel))
 
 
 def _affine(

@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 import sys
+import tracemalloc
 from pathlib import Path
 
 import jax
@@ -20,8 +21,9 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.keypoints.formats import SeenPerson
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.keypoints.reading import read_keypoints
+from humangs_jax.detection.people import Crop, Detection, Landmarks, mask_in_photo, sharpened
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.images import read_grey, write_png
+from humangs_jax.io.images import read_grey, to_uint8, write_png
 
 SIZE = (40, 30)
 BESIDE = np.asarray([0.8, 0.0, 0.3])
@@ -329,6 +331,48 @@ def test_the_exposure_of_a_photo_never_makes_another_person_of_the_person(exposu
     assert alone[1].unclear
     with pytest.raises(ValueError, match=r"^b: which of the people"):
         choose(alone, 0, tmp_path / "s.png")
+
+
+def looked_at(center, side):
+    """What the landmark network says of a crop: an ellipse."""
+    u, v = np.meshgrid(*[np.linspace(-1, 1, 256)] * 2)
+    mask = (u**2 / 0.3 + v**2 / 0.8 < 1).astype(np.float32)
+    crop = Crop(np.asarray(center, float), side, 0.1)
+    points = crop.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (33, 2)))
+    return Landmarks(points, np.ones(33), np.zeros((33, 3)), 1.0, mask, crop, Detection(1.0, *np.eye(2)))
+
+
+@pytest.mark.parametrize("center", [(150, 100), (8, 4), (295, 190)])
+def test_a_mask_is_made_where_the_person_is_and_is_the_one_of_the_whole_photo(center):
+    picture, person = np.random.default_rng(0).uniform(size=(200, 300, 3)).astype(np.float32), looked_at(center, 120.0)
+    whole = to_uint8(sharpened(mask_in_photo(person, 300, 200), picture, 120 / 256))
+    seen = detect._found(person, picture)
+    (top, left), (height, width) = seen.corner, seen.mask.shape
+    np.testing.assert_array_equal(whole[top : top + height, left : left + width], seen.mask)
+    assert whole.sum() == seen.mask.sum() > 0
+
+
+def test_masks_of_many_people_take_no_more_than_the_people_do(monkeypatch):
+    people = [looked_at((500 + 600 * i, 1500), 400.0) for i in range(5)]
+    monkeypatch.setattr(detect, "Networks", lambda: None)
+    monkeypatch.setattr(detect, "find_people", lambda networks, photo: people)
+    large = np.zeros((3000, 4000, 3), np.float32)
+    tracemalloc.start()
+    (photo,) = detect.detect_photos(["a"], [large])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(photo.people) == 5 and peak < large[..., 0].nbytes
+
+
+def test_photos_of_a_capture_without_masks_are_read_once(tmp_path, monkeypatch):
+    shutil.copytree(DEMO, tmp_path / "c")
+    edit_json(tmp_path / "c" / "capture.json", lambda d: [view.pop("mask", None) for view in d["views"]])
+    read = []
+    monkeypatch.setattr(detect, "read_image", lambda *_: read.append(1))
+    monkeypatch.setattr(
+        detect, "detect_photos", lambda names, photos: [photo(name) for name, _ in zip(names, photos, strict=True)]
+    )
+    assert len(detect.found_in_capture(tmp_path / "c")) == 4 and not read
 
 
 def test_two_photos_never_share_a_mask(tmp_path):

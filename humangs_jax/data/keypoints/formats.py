@@ -35,7 +35,6 @@ from humangs_jax.data.keypoints.keypoints import (
     detections_of,
     triples,
 )
-from humangs_jax.detection.people import DetectedPerson
 from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.reading import check_limit, limits, shown, write_json
 
@@ -117,12 +116,6 @@ class ImagePeople:
     image: str
     size: tuple[int, int]
     people: tuple[SeenPerson | None, ...]
-
-
-def seen_person(person: DetectedPerson) -> SeenPerson:
-    """What of a detected person is written."""
-    points = np.column_stack([person.pixels, person.visibility])
-    return SeenPerson(np.asarray(points, np.float64), person.world, person.presence)
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
