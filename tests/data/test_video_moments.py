@@ -8,7 +8,7 @@ from PIL import Image
 
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.calibration.moments import find_moments, progressions
-from humangs_jax.data.calibration.videos import grey_frames, split_video, write_frames
+from humangs_jax.data.calibration.videos import frame_times, grey_frames, split_video, write_frames
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos
 from humangs_jax.io.images import read_image
@@ -56,6 +56,16 @@ def test_a_camera_is_left_out_where_it_dropped_frames(camera):
         assert [n is None for n in numbers] == [i in gap and camera in (name, "all") for i in range(90)]
     assert len(found.warnings) == (3 if camera == "all" else 1)
     assert "no frame at 11 moments (0.67 to 1.00 s): left out there" in found.warnings[0]
+
+
+@pytest.mark.parametrize("names", ["abc", "bca"])
+def test_a_camera_that_lacks_its_first_frames_begins_later(names):
+    times = dict(zip(names, (clock(30, 90), clock(30, 90, range(12)), 0.04 + clock(60, 180)), strict=True))
+    found = find_moments(times)
+    assert len(found.times) == 90
+    assert found.frames[names[0]] == list(range(90)) and found.frames[names[2]] == list(range(0, 180, 2))
+    assert found.frames[names[1]] == [*[None] * 12, *range(78)]
+    assert "no frame at 12 moments (0.00 to 0.37 s)" in found.warnings[0]
 
 
 def test_no_frame_is_of_two_moments():
@@ -113,7 +123,10 @@ def test_videos_of_other_rates_and_with_gaps_become_frames_of_one_moment(tmp_pat
     encode(tmp_path / "videos" / "a.mp4", [moment(i / 10) for i in range(20)], 10)
     encode(tmp_path / "videos" / "b.mp4", [moment(i / 30) for i in range(60)], 30)
     dropped = "select=not(between(n\\,5\\,9))"
+    late = "select=not(lt(n\\,4))"
     encode(tmp_path / "videos" / "c.mp4", [moment(i / 10) for i in range(20)], 10, filters=dropped)
+    encode(tmp_path / "late.mp4", [moment(i / 10) for i in range(20)], 10, filters=late)
+    np.testing.assert_allclose(frame_times(tmp_path / "late.mp4"), np.arange(4, 20) / 10, atol=1e-4)
     report = import_cameras(tmp_path / "rig.json", tmp_path / "videos", tmp_path / "out", up="+y")
     assert (report.frames, report.views) == (20, 55)
     photos = load_photos(tmp_path / "out")

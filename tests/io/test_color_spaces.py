@@ -3,6 +3,7 @@
 import io
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -211,6 +212,37 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
     for name, data in files.items():
         (tmp_path / "a.png").write_bytes(data)
         np.testing.assert_allclose(255 * read_image(tmp_path / "a.png")[0], COLORS, atol=2, err_msg=name)
+
+
+HEIC = (Path(__file__).parent / "phone.heic").read_bytes()
+"""Red, the upper left quarter blue; see test_images."""
+
+
+def with_box(heic, box):
+    """A HEIC photo with another box of colors: what holds it grows, and places in the file move."""
+    at = heic.index(b"colr") - 4
+    size = int.from_bytes(heic[at : at + 4], "big")
+    data, more = bytearray(heic), len(box) - size
+    for place in [heic.index(name) - 4 for name in (b"ipco", b"iprp", b"meta")]:
+        data[place : place + 4] = struct.pack(">I", int.from_bytes(data[place : place + 4], "big") + more)
+    for old in (481, 584):  # of its two parts
+        place = heic.index(struct.pack(">I", old), heic.index(b"iloc"))
+        data[place : place + 4] = struct.pack(">I", old + more)
+    data[at : at + size] = box
+    return bytes(data)
+
+
+def test_heic_photos_have_profiles_and_numbers_too(tmp_path):
+    pytest.importorskip("pi_heif")
+    numbers = HEIC.replace(b"colrnclx\x00\x01", b"colrnclx\x00\x0c")
+    profile = with_box(HEIC, struct.pack(">I", 12 + len(P3)) + b"colrprof" + P3)
+    (tmp_path / "plain.heic").write_bytes(HEIC)
+    plain = read_image(tmp_path / "plain.heic")[0]
+    light = srgb_to_light(plain) @ (np.linalg.inv(profiles.SRGB_TO_XYZ) @ profiles.P3_TO_XYZ).T
+    for data in (numbers, profile):
+        (tmp_path / "a.heic").write_bytes(data)
+        np.testing.assert_allclose(read_image(tmp_path / "a.heic")[0], light_to_srgb(np.clip(light, 0, 1)), atol=0.02)
+    assert np.abs(light_to_srgb(np.clip(light, 0, 1)) - plain).mean() > 0.02
 
 
 def test_numbers_in_an_avif_say_how_colors_are_encoded(tmp_path):

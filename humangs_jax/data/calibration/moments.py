@@ -1,7 +1,7 @@
 """Which frames of several videos show one moment: by time, because rates differ and phones drop frames.
 
-All videos begin at the same moment. The slowest one says which moments there are; each other camera gives the frame that is
-nearest in time, or none, where it has a gap.
+All videos begin at the same moment, time 0 of their files. The slowest one says which moments there are; each other camera gives
+the frame that is nearest in time, or none, where it has a gap.
 """
 
 import itertools
@@ -19,6 +19,9 @@ GAP = 1.5
 """Steps between two frames, beyond which frames are missing between them."""
 SAME_RATE = 0.01
 """Share by which the steps of cameras of one rate differ."""
+LATE, MOST_LATE = 0.1, 3.0
+"""Seconds after the first frames of others, between which a camera lacks its first ones: encoders shift them by less, and what
+counts time from elsewhere by more."""
 USUAL_STEP = 1 / 30
 """Seconds between two frames, where no video tells."""
 
@@ -41,7 +44,8 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
     slowest = max(known, default=USUAL_STEP)
-    clocks = {camera: _clock(each, steps[camera], slowest) for camera, each in times.items()}
+    first = min((each[0] for each in times.values()), default=0.0)
+    clocks = {camera: _clock(each, steps[camera], slowest, first) for camera, each in times.items()}
     moments = _all_moments(clocks, {camera: step or slowest for camera, step in steps.items()})
     frames = {camera: nearest(each, moments) for camera, each in clocks.items()}
     counts = {camera: len(each) for camera, each in times.items()}
@@ -56,17 +60,21 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
     return float(np.mean(apart[apart < GAP * np.median(apart)]))
 
 
-def _clock(times: Float[np.ndarray, " n"], step: float | None, slowest: float) -> Float[np.ndarray, " n"]:
-    """Seconds after the first frame; where a video does not tell them it is taken to be as fast as the slowest one."""
-    return np.arange(len(times)) * slowest if step is None else times - times[0]
+def _clock(times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float) -> Float[np.ndarray, " n"]:
+    """Seconds after the first frame, or after the `first` one of all; a video that does not tell is as fast as the slowest."""
+    if step is None:
+        return np.arange(len(times)) * slowest
+    late = times[0] - first
+    return times - times[0] + (late if LATE < late < MOST_LATE else 0.0)
 
 
 def _all_moments(clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]) -> Float[np.ndarray, " m"]:
-    """The times of the slowest camera, with those that it lacks in its gaps and behind its end."""
+    """The times of the slowest camera, with those that it lacks at its start, in its gaps and behind its end."""
     slowest = max(steps.values())
     slow = [camera for camera, step in steps.items() if step > (1 - SAME_RATE) * slowest]
     own = max((clocks[camera] for camera in slow), key=lambda each: len(each))
-    parts = [own[:1]]
+    earlier = own[0] - slowest * np.arange(round(own[0] / slowest), 0, -1)
+    parts = [earlier, own[:1]]
     for before, after in itertools.pairwise(own.tolist()):
         missing = round((after - before) / slowest) if after - before > GAP * slowest else 1
         parts.append(before + (after - before) * np.arange(1, missing + 1) / missing)

@@ -60,6 +60,8 @@ class _Shown(NamedTuple):
     """The colors, in words."""
     rate: float | None = None
     """Frames a second in the mean."""
+    from_zero: bool = False
+    """Whether times of such files count from their beginning."""
 
 
 class VideoPhotos(NamedTuple):
@@ -159,12 +161,13 @@ def _mask_frames(path: Path, camera: str, moments: Moments, seconds: float | Non
 
 
 def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
-    """Seconds at which the frames of a video are shown, in order, up to some; NaN where it does not say.
+    """Seconds of its file at which the frames of a video are shown, in order, up to some; NaN where it does not say.
 
     Raises: CaptureError naming the video.
     """
     with reading(path, "video", CaptureError):
         command = _ffmpeg(path, "metadata=mode=add:key=a:value=a,metadata=mode=print:file=-")
+        command += ["-copyts"] if _shown(path).from_zero else []
         command += [] if seconds is None else ["-t", f"{seconds:.6f}"]
         lines = _finished(path, [*command, "-f", "null", "-"]).decode(errors="replace")
         found = re.findall(r"^frame:.*pts_time:(\S+)", lines, re.MULTILINE)
@@ -266,11 +269,13 @@ def _shown(path: Path) -> _Shown:
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
     printed = subprocess.run(_opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False).stderr
-    line = STREAM.search(printed.decode(errors="replace"))
+    text = printed.decode(errors="replace")
+    line = STREAM.search(text)
     if line is None:
         return _Shown()  # what reads its frames says what is wrong
     rate, shape, colors = RATE.search(line[1]), PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
-    found = _Shown(rate=float(rate[1]) * (1000 if rate[2] else 1) if rate else None)
+    a_second = float(rate[1]) * (1000 if rate[2] else 1) if rate else None
+    found = _Shown(rate=a_second, from_zero="Input #0, mpegts" not in text)
     if shape is not None and shape[1] != shape[2]:
         wide, high = int(shape[1]), int(shape[2])
         if max(wide, high) > WIDEST_PIXEL * min(wide, high):
