@@ -1,5 +1,6 @@
 """The demonstration: an unseen person, four photos, one forward pass, some seconds of refinement, new views, a walk."""
 
+import contextlib
 import dataclasses
 import os
 import platform
@@ -28,14 +29,19 @@ from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.evaluation.cases import draw_painted_body, painted_body
 from humangs_jax.evaluation.scores import score
-from humangs_jax.io.atomic import add_files
-from humangs_jax.io.reading import write_json
+from humangs_jax.io.atomic import add_files, check_ours
+from humangs_jax.io.reading import read_json, write_json
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.viewer.page import write_page
 
+PICTURES = ("inputs.png", "novel_views.png", "refined.png", "animation.mp4", "animation.gif", "novel_views.exr")
+FILES = ("report.json", *PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
+"""What the demonstration writes; the first tells that a folder is of it."""
+REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
+"""Keys of the first."""
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
 
 
@@ -57,8 +63,22 @@ def run_demo(
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()
-    add_files(Path(out), lambda folder: report.update(_write_demo(folder, weights, frame_size, refine, settings)))
+    _check_place(Path(out))
+    write = lambda folder: report.update(_write_demo(folder, weights, frame_size, refine, settings))
+    add_files(Path(out), write, first=FILES[0])
     return report
+
+
+def _check_place(out: Path) -> None:
+    """Whether a folder is that of an earlier demo, or holds nothing with the name of what is made.
+
+    Raises: ValueError, see `io.atomic.check_ours`.
+    """
+    known = None
+    with contextlib.suppress(OSError, ValueError):
+        known = read_json(out / FILES[0])
+    if not (isinstance(known, dict) and known.keys() >= REPORTED):
+        check_ours((out / name for name in FILES), lambda file: False)
 
 
 def summary(report: dict[str, Any]) -> str:

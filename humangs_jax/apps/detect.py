@@ -7,6 +7,7 @@
 Who of one photo is who of another: `apps.same_people`.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.folders import unused_line
-from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, write_people
+from humangs_jax.data.keypoints.formats import ImagePeople, SeenPerson, read_people, write_people
 from humangs_jax.data.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.data.masks import box_of
 from humangs_jax.data.photos import Photos, load_photos, read_description
@@ -36,8 +37,8 @@ from humangs_jax.detection.people import (
     mask_window,
     sharpened,
 )
-from humangs_jax.io.atomic import add_files
-from humangs_jax.io.images import MASK, orientation, oriented, read_image, resized, to_uint8, write_png
+from humangs_jax.io.atomic import MOVE_AWAY, add_files, check_ours
+from humangs_jax.io.images import MASK, mark_of, orientation, oriented, read_image, resized, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.png", "masks"
@@ -214,8 +215,9 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 
 
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
-    """Write the sheet that an error speaks of."""
+    """Write the sheet that an error speaks of. Raises: ValueError where a picture of others has its name."""
     sheet.parent.mkdir(parents=True, exist_ok=True)
+    check_ours([sheet], _is_ours, "several people may be meant, and their numbers belong there: move it away")
     write_sheet(sheet, photos)
 
 
@@ -268,15 +270,54 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
+def check_found_place(folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True) -> None:
+    """Whether what is found in photos of these names can be written without replacing files of others.
+
+    Raises: ValueError, see `io.atomic.check_ours`.
+    """
+    files = [KEYPOINTS_FILE, SHEET_FILE, *(map(mask_name, names) if masks else ())]
+    check_ours((folder / file for file in files), _is_ours, advice)
+
+
+def names_in(folder: Path) -> list[str]:
+    """The names of the photos that `found_in_photos` looks at. Raises: as it."""
+    if (folder / "capture.json").is_file():
+        return [f"{name}.png" for name in load_photos(folder).names]
+    images, files = photo_files(folder)
+    return [file.relative_to(images).as_posix() for file in files]
+
+
+def mask_name(photo: str) -> str:
+    """The path of the mask of a photo in the folder that is written."""
+    return f"{MASKS}/{Path(photo).with_suffix('.png').as_posix()}"
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether a file that is there was written by `write_found`. capture.json is that of the photos, which gets their masks."""
+    if file.name == KEYPOINTS_FILE:
+        with contextlib.suppress(OSError, ValueError):
+            read_people(file)
+            return True
+        return False
+    return file.name == "capture.json" or mark_of(file) is not None
+
+
 def write_found(
-    folder: Path, photos: Sequence[PhotoPeople], person: int, *, masks: bool = True, to_capture: bool = False
+    folder: Path,
+    photos: Sequence[PhotoPeople],
+    person: int,
+    *,
+    masks: bool = True,
+    to_capture: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Keypoints and masks of a person, and the sheet, into a folder; all or nothing.
 
-    Arguments: to_capture: the folder is the capture whose photos these are, which then names the masks.
-    Raises: ValueError if two photos have the same name but for the suffix.
+    Arguments: to_capture: the folder is the capture whose photos these are, which then names the masks. overwrite: replace files
+    that were not written by this function, too.
+    Raises: ValueError if two photos have the same name but for the suffix, or for a file of others, see `check_found_place`.
     """
-    files = [f"{MASKS}/{Path(photo.name).with_suffix('.png').as_posix()}" for photo in photos]
+    files = [mask_name(photo.name) for photo in photos]
     owners: dict[str, str] = {}
     for photo, file in zip(photos, files, strict=True):
         if (other := owners.setdefault(file, photo.name)) != photo.name:
@@ -295,7 +336,9 @@ def write_found(
             views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
             write_json(temporary / "capture.json", description | {"views": views})
 
-    add_files(folder, write)
+    if not overwrite:
+        check_found_place(folder, [photo.name for photo in photos], masks=masks)
+    add_files(folder, write, ours=None if overwrite else _is_ours)
 
 
 def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:

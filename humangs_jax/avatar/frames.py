@@ -25,8 +25,8 @@ from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.io.atomic import add_files
-from humangs_jax.io.images import DRAWN, write_png
+from humangs_jax.io.atomic import add_files, check_ours
+from humangs_jax.io.images import DRAWN, is_own_output, write_png
 from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
@@ -374,7 +374,8 @@ def write_splat_views(out: Path, gaussians: Gaussians, cameras: Mapping[str, Cam
         for name, image in zip(cameras, splat_images(gaussians, cameras, shot), strict=True):
             write_png(folder / f"{name}.png", image, mark=DRAWN)
 
-    add_files(out, write)
+    check_ours((out / f"{name}.png" for name in cameras), is_own_output)
+    add_files(out, write, ours=is_own_output)
     return len(cameras)
 
 

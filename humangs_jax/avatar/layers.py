@@ -34,8 +34,8 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import bar
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.atomic import add_files, replace_file
-from humangs_jax.io.images import DRAWN, write_png
+from humangs_jax.io.atomic import add_files, check_ours, replace_file
+from humangs_jax.io.images import DRAWN, is_own_output, write_png
 from humangs_jax.io.reading import limits
 from humangs_jax.rendering.buffers import plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
@@ -120,6 +120,7 @@ def write_views(
                 f"{out / EXR_NAME}: {count} views are {size:.3g} bytes, more than {most:.3g}: expected fewer or smaller ones"
             )
     how = splatting_of(shot, avatar)
+    check_ours((out / f"{name}.png" for name in names), is_own_output)
 
     def write(folder: Path):
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
@@ -131,7 +132,8 @@ def write_views(
         if exr is not None:
             write_exr(folder / EXR_NAME, views, half=exr.half)
 
-    add_files(out, write, without=[file.name for file in (*out.glob("view_*.png"), *out.glob(EXR_NAME))])
+    old = [file.name for file in (*out.glob("view_*.png"), *out.glob(EXR_NAME))]
+    add_files(out, write, without=old, ours=is_own_output)
     return count
 
 

@@ -18,8 +18,8 @@ from humangs_jax.core.array_types import Float, UInt8
 from humangs_jax.core.checks import ROUNDING, checked_arguments
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.registry import alternatives
-from humangs_jax.io.atomic import add_files, replace_file
-from humangs_jax.io.images import DRAWN, to_uint8, write_png
+from humangs_jax.io.atomic import add_files, check_ours, replace_file
+from humangs_jax.io.images import DRAWN, is_own_output, to_uint8, write_png
 
 Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
 CHANNELS = (3, 4)
@@ -105,8 +105,10 @@ def write_video(
     if path.suffix:
         replace_file(path, lambda temporary: form(temporary, frames, float(fps), first.shape))
     else:
-        old = [file.name for file in path.glob("frame_*.png")]
-        add_files(path, lambda folder: form(folder, frames, float(fps), first.shape), without=old)
+        old = sorted(path.glob("frame_*.png"))
+        check_ours(old, is_own_output)
+        write = lambda folder: form(folder, frames, float(fps), first.shape)
+        add_files(path, write, without=[file.name for file in old], ours=is_own_output)
     return next(count)
 
 

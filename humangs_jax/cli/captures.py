@@ -38,6 +38,10 @@ def keypoints_wanted() -> tuple[str, ...]:
     return () if available() else ("--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the photos)",)
 
 
+GIVE_IT = "move it away, or give keypoints that are there by --keypoints FILE"
+"""Where a capture has files of others with the names of what is found."""
+
+
 def found_here(capture: Path, person: int | None) -> Path:
     """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints, and masks if there are none.
 
@@ -50,6 +54,7 @@ def found_here(capture: Path, person: int | None) -> Path:
     file = folder / detect.KEYPOINTS_FILE
     photos = load_photos(folder)
     if not file.exists() or person is not None or photos.masks is None:
+        detect.check_found_place(folder, [f"{name}.png" for name in photos.names], GIVE_IT, masks=photos.masks is None)
         people, number = detect.person_in_capture(folder, photos, person=person)
         detect.write_found(folder, people, number, masks=photos.masks is None, to_capture=True)
         tell_found(people, number)
@@ -72,17 +77,21 @@ class Detect:
     """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
     """Which person, by the number on people.png. Default: the one who is largest."""
+    overwrite: bool = False
+    """Replace keypoints.json, people.png and masks of other programs, too."""
 
     def run(self) -> None:
         with stage("starting"):
             from humangs_jax.apps import detect
 
+        if not self.overwrite:
+            detect.check_found_place(self.out, detect.names_in(self.photos), "choose another folder, or --overwrite")
         with stage("finding people"):
             photos = detect.found_in_photos(self.photos)
             left_out = detect.left_out(self.photos)
         person = detect.choose(photos, self.person, self.out / detect.SHEET_FILE)
         with stage("writing"):
-            detect.write_found(self.out, photos, person)
+            detect.write_found(self.out, photos, person, overwrite=self.overwrite)
         tell_found(photos, person)
         if left_out is not None:
             tell(left_out)

@@ -23,6 +23,8 @@ from humangs_jax.core.processes import undisturbed
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
+MOVE_AWAY = "move it away, or choose another folder"
+"""What can be done where a file that was not written here has the name of one that is to be written."""
 TOLD = 12
 """Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?")
@@ -231,6 +233,8 @@ def add_files(
     without: Iterable[str | os.PathLike[str]] = (),
     invalid: Iterable[str | os.PathLike[str]] = (),
     last: str | os.PathLike[str] | None = None,
+    first: str | os.PathLike[str] | None = None,
+    ours: Callable[[Path], bool] | None = None,
 ) -> None:
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
@@ -239,8 +243,10 @@ def add_files(
 
     Arguments: without: files in the folder that are out of date; those that are not replaced are deleted after the last move.
     invalid: files that must never lie beside the new ones; they are deleted before the first move.
-    last: the file that is moved last: where it was not there before, it says that all others are in place.
-    Raises: OSError, naming `folder`, if it cannot be written; whatever `write` raises.
+    last: the file that is moved last: where it was not there before, it says that all others are in place. first: the one that
+    is moved first: it says that the others are ours. ours: whether a file that is there may be replaced or deleted; None: all.
+    Raises: ValueError for a file that is there and not ours, see `check_ours`; OSError, naming `folder`, if it cannot be written;
+        whatever `write` raises.
     """
     folder = Path(folder)
     inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
@@ -255,16 +261,33 @@ def add_files(
         with undisturbed():
             folder.mkdir(exist_ok=True)
             with _locked(folder, wait=True):
-                for file in invalid:
-                    (folder / file).unlink(missing_ok=True)
                 new = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
                 if last is not None:
                     new.sort(key=lambda file: file == Path(last))
+                if first is not None:
+                    new.sort(key=lambda file: file != Path(first))
+                if ours is not None:
+                    check_ours((folder / file for file in new), ours)
+                    without = [file for file in without if ours(folder / file)]
+                for file in invalid:
+                    (folder / file).unlink(missing_ok=True)
                 for file in new:
                     (folder / file).parent.mkdir(parents=True, exist_ok=True)
                     (temporary / file).replace(folder / file)
                 for file in {Path(file) for file in without}.difference(new):
                     (folder / file).unlink(missing_ok=True)
+
+
+def check_ours(files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY) -> None:
+    """Whether files can be written without losing what others wrote there, to be asked before the work, too.
+
+    Arguments: ours: whether a file that is there may be replaced. advice: what the user can do.
+    Raises: ValueError, naming the first that may not.
+    """
+    foreign = [file for file in files if file.exists() and not ours(file)]
+    if foreign:
+        more = f" (and {len(foreign) - 1} more)" if len(foreign) > 1 else ""
+        raise ValueError(f"{foreign[0]}{more}: exists, and was not written by humangs: {advice}")
 
 
 @contextlib.contextmanager

@@ -256,6 +256,17 @@ def is_own_picture(path: str | Path) -> bool:
     return mark_of(path) == DRAWN
 
 
+def is_own_output(path: str | Path) -> bool:
+    """Whether a new output may replace a file of the same name: an own picture, or what is no picture of anybody."""
+    if Path(path).suffix.lower() != ".png" or is_own_picture(path):
+        return True
+    try:
+        image_size(path)
+    except (OSError, ValueError):
+        return True
+    return False
+
+
 def image_row(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:
     """Images side by side, reduced to one height, pixels."""
     return np.concatenate([resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images], axis=1)

@@ -28,9 +28,10 @@ from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.io.atomic import write_text
-from humangs_jax.io.images import DRAWN, png_bytes, write_png
+from humangs_jax.io.atomic import check_ours, write_text
+from humangs_jax.io.images import DRAWN, is_own_picture, png_bytes, write_png
 from humangs_jax.io.mesh import INDICES, VERTICES, GlbWriter
+from humangs_jax.io.reading import open_file
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
@@ -257,8 +258,27 @@ def _continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]
 # OBJ ------------------------------------------------------------------------------------------------------------------
 
 
+WRITTEN = "# written by humangs_jax"
+"""How an `.obj` and its `.mtl` begin."""
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether a texture or a material was written here."""
+    if file.suffix == ".png":
+        return is_own_picture(file)
+    with open_file(file) as opened:
+        return opened.read(len(WRITTEN)) == WRITTEN.encode()
+
+
+def check_beside(path: Path) -> None:
+    """Whether the texture and the material of an `.obj` replace no file of others. Raises: ValueError."""
+    advice = "it would become the texture or material: choose another name for the .obj, or move it away"
+    check_ours((path.with_suffix(suffix) for suffix in (".png", ".mtl")), _is_ours, advice)
+
+
 def write_poses(path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str) -> None:
     """An `.obj` for each pose of a motion, or of the T-pose with its feet on 0; all share the texture beside `path`."""
+    check_beside(path)
     mesh = body_mesh(avatar)
     material = write_material(path, mesh)
     floor = np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
@@ -271,7 +291,7 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
     """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them. Returns the `.mtl`'s path."""
     texture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
-    write_text(material, f"newmtl skin\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture.name}\n")
+    write_text(material, f"{WRITTEN}\nnewmtl skin\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture.name}\n")
     return material
 
 
@@ -281,7 +301,7 @@ def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
     rows = lambda key, values: [f"{key} " + " ".join(f"{x:.6g}" for x in row) for row in values.tolist()]
     corners = [" ".join(f"{i}/{i}/{i}" for i in face) for face in (mesh.faces + 1).tolist()]
     lines = [
-        f"# written by humangs_jax: metres, {up} up",
+        f"{WRITTEN}: metres, {up} up",
         f"mtllib {material.name}",
         "o body",
         *rows("v", mesh.vertices @ turn.T),
