@@ -239,6 +239,26 @@ def test_a_camera_that_is_off_shows_the_same_person_and_is_named(views, turned, 
     assert all(read_grey(tmp_path / "masks" / f"c{v}.png").any() for v in range(views))
 
 
+@pytest.mark.slow  # detects and fits
+def test_a_fit_sees_the_photo_of_a_camera_that_is_off_and_turns_it_back(tmp_path, capsys):
+    shutil.copytree(DEMO, tmp_path / "c", ignore=shutil.ignore_patterns("body.npz", "masks"))
+    tilt = np.eye(4)
+    tilt[:3, :3] = Rotation.from_euler("x", 5, degrees=True).as_matrix()
+
+    def change(description):
+        for view in description["views"]:
+            del view["mask"]
+        first = description["views"][0]
+        first["cam_from_world"] = (tilt @ np.asarray(first["cam_from_world"])).tolist()
+
+    edit_json(tmp_path / "c" / "capture.json", change)
+    assert cli.execute(["fit", str(tmp_path / "c")]) == 0
+    out, err = capsys.readouterr()
+    assert "0_00.png: the person is not where the other photos of the moment show them" in err
+    assert "camera 0_00 is off by 5" in out and "turned back" in out
+    assert all(read_grey(tmp_path / "c" / "masks" / f"0_0{v}.png").mean() > 0.1 for v in range(4))
+
+
 def test_of_two_cameras_that_do_not_agree_both_are_named(tmp_path):
     photos = [seen_at(f"c{v}", camera_at(80 * v), BODY) for v in range(2)]
     photos = same_people(photos, batch([camera_at(0, 9.0), camera_at(80)]))
