@@ -1,7 +1,9 @@
 import dataclasses
 import functools
 import inspect
+import io
 import logging
+import os
 import re
 import shlex
 import subprocess
@@ -160,6 +162,17 @@ class Sample:
 def sample(monkeypatch):
     monkeypatch.setattr(cli, "_command", lambda name: Sample)
     monkeypatch.setitem(cli.COMMANDS, "sample", "")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+@pytest.mark.parametrize("name", ["für mich", "it's \\ 1", "a\nb", "\udce9t\udce9", "plain"])
+def test_a_path_of_the_next_command_can_be_pasted(name, encoding, monkeypatch):
+    """Whatever the terminal shows: bash gets the bytes of the name."""
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    text = screen.quoted(Path(name))
+    assert text.isprintable() and text.encode(encoding)
+    bash = ["bash", "-c", f"printf %s {text}"]
+    assert subprocess.run(bash, capture_output=True, check=True, env={"LC_ALL": "C.UTF-8"}).stdout == os.fsencode(name)
 
 
 def test_a_command_ends_with_what_it_wrote_how_long_it_took_and_what_is_next(sample, capsys):

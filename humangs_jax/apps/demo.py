@@ -23,7 +23,7 @@ from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
-from humangs_jax.core.progress import stage
+from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -164,7 +164,8 @@ def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
     """Run a stage and record its seconds; `twice`: separately for compiling (first run less second) and running (second)."""
     start = time.perf_counter()
-    result = jax.block_until_ready(run())
+    with stage(COMPILING) if twice else contextlib.nullcontext():
+        result = jax.block_until_ready(run())
     first = time.perf_counter() - start
     timings[name] = {"seconds": round(first, 3)}
     if twice:

@@ -18,7 +18,7 @@ from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_t
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.core.progress import bar
+from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
@@ -296,7 +296,7 @@ def images(
     progress: what a progress bar says; None: no bar.
     """
     drawn = draw(avatar, poses, cameras, jnp.zeros(3), splatting_of(shot, avatar))
-    shown = bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None)
+    shown = bar(drawn, total=len(poses), desc=progress, unit="frame", first=COMPILING, shown=progress is not None)
     return (image_of(rendering, shot.color()) for rendering in shown)
 
 
@@ -317,7 +317,7 @@ def without_unseen(avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatC
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
-    for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None):
+    for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", first=COMPILING, shown=progress is not None):
         most = np.maximum(most, rendering.visibility)
     return avatar.select(np.flatnonzero(most >= ALPHA_MIN))
 
@@ -363,8 +363,9 @@ def circle_cameras(gaussians: Gaussians, up: Up, views: int, shot: Shot) -> dict
 def splat_images(gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> Iterator[Float[np.ndarray, "h w c"]]:
     """One image for each camera, in bounded memory; with alpha where the shot's background is transparent."""
     config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
-    for camera in bar(list(cameras.values()), desc="render", unit="view"):
-        yield image_of(render_in_bands(gaussians, camera, config, jnp.zeros(3)), shot.color())
+    drawn = (render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values())
+    for rendering in bar(drawn, total=len(cameras), desc="render", unit="view", first=COMPILING):
+        yield image_of(rendering, shot.color())
 
 
 def write_splat_views(out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: Shot) -> int:

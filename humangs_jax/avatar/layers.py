@@ -32,7 +32,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import ArgumentError
-from humangs_jax.core.progress import bar
+from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files, check_ours, replace_file
 from humangs_jax.io.images import DRAWN, is_own_output, write_png
@@ -125,7 +125,7 @@ def write_views(
     def write(folder: Path):
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
         views = []
-        for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", shown=progress)):
+        for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", first=COMPILING, shown=progress)):
             write_png(folder / f"{names[i]}.png", image_of(rendering, shot.color()), mark=DRAWN)
             if exr is not None:
                 views.append(exr_view(names[i], avatar, poses[i], cameras[i], rendering, exr.layers, how))

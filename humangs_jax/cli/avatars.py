@@ -55,7 +55,7 @@ class Demo:
     size: Side = 256
     """Side of the animation's frames in pixels."""
     refine: str | None = None
-    """How long to fit the avatar to its photos: 15s, 100steps, or 0. Default: 15s, or as --preset says."""
+    """How long to fit the avatar to its photos: 15s (or 15), 100steps, or 0. Default: 15s, or as --preset says."""
     preset: Preset | None = None
     """Speed against accuracy (docs: tradeoff): photos, network, splatting, and refinement without --refine."""
 
@@ -71,6 +71,7 @@ class Demo:
             refine = settings.refinement
         report = run_demo(self.out, self.weights, self.size, refine, settings)
         wrote(self.out, summary(report))
+        suggest("open", self.out / "avatar.html", "in a browser")
         suggest("humangs view", self.out / "avatar.npz")
 
 
@@ -100,7 +101,7 @@ class Reconstruct:
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to its photos for so long: 15s, 100steps, or 0. Default, with masks: iterations and the head."""
+    """Fit the avatar to its photos for so long: 15s (or 15), 100steps, or 0. Default, with masks: iterations and the head."""
     preset: Preset | None = None
     """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the options above."""
     config: Path | None = None
@@ -217,7 +218,7 @@ class Refine:
     out: Annotated[Path, AVATAR] = Path("refined.npz")
     """The avatar file to write or replace."""
     limit: str = "15s"
-    """How long after compiling: 15s, 100steps, or 0steps for the iterations alone."""
+    """How long after compiling: 15s (or 15), 100steps, or 0steps for the iterations alone."""
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
     """Learned-optimizer iterations before the steps."""
     image_size: Side | None = None

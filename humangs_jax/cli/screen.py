@@ -173,7 +173,23 @@ def fail(error: BaseException, verbose: bool) -> None:
 
 def suggest(*command: str | Path) -> None:
     """What to do next: the parts of a command line; paths are quoted, text is not."""
-    progress.current().next.append(" ".join(shlex.quote(str(part)) if isinstance(part, Path) else part for part in command))
+    progress.current().next.append(" ".join(quoted(part) if isinstance(part, Path) else part for part in command))
+
+
+def quoted(path: Path) -> str:
+    r"""A path as a shell takes it, even where the terminal cannot show it: then as $'f\xc3\xbcr', which bash and zsh read."""
+    text = str(path)
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        shown = False
+    else:
+        shown = progress.printable(text) == text
+    if shown:
+        return shlex.quote(text)
+    plain = [chr(byte) if 0x20 <= byte < 0x7F and byte not in b"'\\" else f"\\x{byte:02x}" for byte in os.fsencode(path)]
+    return f"$'{''.join(plain)}'"
 
 
 def finish() -> None:

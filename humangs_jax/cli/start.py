@@ -60,7 +60,7 @@ class Start:
     fit_masks: Annotated[bool, off("move masks that are too large or too small to the edges in the photos")] = True
     """Move masks that are too large or too small to the edges in the photos."""
     refine: str | None = None
-    """Fit the avatar to the photos for so long: 15s, 100steps, or 0. Default, with masks: iterations and the head."""
+    """Fit the avatar to the photos for so long: 15s (or 15), 100steps, or 0. Default, with masks: iterations and the head."""
     browser: Annotated[bool, off("open the page at the end")] = True
     """Open the page at the end."""
     overwrite: bool = False

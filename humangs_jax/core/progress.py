@@ -17,7 +17,7 @@ import threading
 import time
 import unicodedata
 import weakref
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from typing import Any
 
 SHOWN = {"Zs", "Cn", "Co"}
@@ -159,12 +159,17 @@ def stage(name: str) -> Generator[None]:
                 say(f"{name}: {seconds:.1f} s", error=True)
 
 
-def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any) -> Any:
+COMPILING = "compiling, once"
+"""What a bar says until its first item is there, where a program of JAX is compiled for that: many seconds."""
+
+
+def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any) -> Any:
     """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around it.
 
     Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.
 
-    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all of them.
+    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all of them. first: what it
+    says until the first item is there.
     """
     from tqdm import tqdm
 
@@ -178,12 +183,28 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
     made = tqdm(iterable, disable=not shown or _current.quiet, **how)
     if not made.disable:
         _bars.add(made)
+        if first:
+            made.set_postfix_str(first)
+            made.iterable = _without_postfix(iterable or (), made)
     return made
+
+
+def _without_postfix(items: Iterable[Any], made: Any) -> Iterator[Any]:
+    """The items; what a bar says about the first one goes when it is there."""
+    for i, item in enumerate(items):
+        if i == 0:
+            made.set_postfix_str("", refresh=False)
+        yield item
 
 
 def _close(bars: set[Any]) -> None:
     for each in bars:
         each.close()
+
+
+def followed() -> bool:
+    """Whether a program shows stages, on a terminal or in a log."""
+    return _current.ticking or _current.naming
 
 
 def watched() -> bool:

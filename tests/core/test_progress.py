@@ -124,3 +124,24 @@ def test_long_stages_are_named_where_there_is_no_terminal(monkeypatch, capsys):
             time.sleep(0.3)
         progress.end()
         assert capsys.readouterr().err == ("" if quiet else "fitting ...\n")
+
+
+def test_a_bar_says_why_its_first_item_takes_long(capsys):
+    seen = []
+    with progress.bar(iter("abc"), total=3, desc="render", first=progress.COMPILING) as shown:
+        before = capsys.readouterr().err
+        for item in shown:
+            seen.append((item, shown.postfix))
+    assert seen == [("a", ""), ("b", ""), ("c", "")]
+    assert "render:   0%" in before and "compiling, once" in before
+    assert "compiling" not in capsys.readouterr().err.rpartition("\r")[2]
+    assert list(progress.bar("abc", shown=False, first="x")) == ["a", "b", "c"] and capsys.readouterr().err == ""
+
+
+def test_long_loops_show_bars_where_a_program_shows_stages(capsys):
+    assert not progress.followed()
+    progress.begin()
+    assert progress.followed()
+    progress.begin(quiet=True)
+    assert not progress.followed()
+    progress.end()

@@ -26,6 +26,7 @@ from humangs_jax.avatar.export.gaussians import up_matrix, up_turn
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.core.checks import BOUNDED, check_values
+from humangs_jax.core.progress import bar, followed
 from humangs_jax.data.motion import Motion
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.atomic import check_ours, write_text
@@ -128,7 +129,7 @@ def skin_colors(avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float
     )
     means, opacities, colors = (np.asarray(x, np.float32) for x in (g.means, g.opacities, g.colors))
     out = np.empty((len(points), 3), np.float32)
-    for start in range(0, len(points), CHUNK):
+    for start in bar(range(0, len(points), CHUNK), desc="texture", unit="part", shown=followed()):
         place, normal = points[start : start + CHUNK], normals[start : start + CHUNK]
         near = tree.query(place, k=count)[1].reshape(len(place), count)
         # in the Gaussians' own axes, over their scales: x.A y is a plain product there
