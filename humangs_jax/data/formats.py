@@ -140,6 +140,12 @@ CAMERAS = SourceFormats(
         content="JSON: a list `cameras` of `K`, `distCoef`, `R`, `t`, `resolution`",
         unit=0.01,
     ),
+    multical=CameraFormat(
+        "multical",
+        _CAMERAS + "rigs:read_multical",
+        files=("calibration.json",),
+        content="JSON: `K`, `dist`, `image_size` of each in `cameras`, `R`, `T` in `camera_poses` (`NAME` or `NAME_to_OTHER`)",
+    ),
     opencv=CameraFormat(
         "OpenCV, AvatarReX or THuman4.0",
         _CAMERAS + "rigs:read_opencv",

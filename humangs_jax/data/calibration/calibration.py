@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.data.calibration.unknown import binary_kind, described
 from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, file_numbers, floats
 from humangs_jax.data.formats import CAMERAS, CameraFormat
 from humangs_jax.io.reading import limits, reading
@@ -164,8 +165,13 @@ def read_calibration(path: Path, photo_size: Callable[[str], tuple[int, int]]) -
         if format is not None and format.folder:
             return format(Source(file.parent, photo_size), format)
         source = Source(file, photo_size)
-        if (format := CAMERAS.of_content(source)) is None:
-            raise CaptureError(file, "", f"not a known format: expected {CAMERAS.listed()}")
+        found = binary_kind(file)
+        format = None
+        if found is None or file.suffix.lower() in CAMERAS.suffixes:
+            format = CAMERAS.of_content(source)
+        if format is None:
+            found = described(source.text) if found is None else found
+            raise CaptureError(file, found, f"not a known format: expected {CAMERAS.listed()}")
         return format(source, format)
 
 

@@ -241,6 +241,62 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
     return source.calibration(format, cameras)
 
 
+# multical: `cameras` with lenses, and `camera_poses` from one camera to another -------------------------------------------
+
+RELATIVE = "_to_"
+"""Between the names of two cameras: the pose of the first, in the axes of the second, as X_first = R X_second + T."""
+
+
+def recognizes_multical(source: Source) -> bool:
+    """Whether a file has maps of cameras and of their poses."""
+    return isinstance(source.json, dict) and all(isinstance(source.json.get(key), dict) for key in ("cameras", "camera_poses"))
+
+
+def read_multical(source: Source, format: CameraFormat) -> Calibration:
+    """The cameras of both maps; the world is the camera that has a pose of its own. Raises: CaptureError naming the key."""
+    file, lenses = source.path, source.json["cameras"]
+    poses: dict[str, Float[np.ndarray, "4 4"]] = {}
+    waiting: dict[str, tuple[str, Float[np.ndarray, "4 4"]]] = {}
+    for key, entry in source.json["camera_poses"].items():
+        field = f"camera_poses.{key}"
+        expect(entry, dict, file, field)
+        for part in ("R", "T"):
+            if part not in entry:
+                raise CaptureError(file, f"{field}.{part}", "missing")
+        turn = rotation(entry["R"], file, f"{field}.R")
+        pose = pose_matrix(turn, floats(entry["T"], file, f"{field}.T", (3,)))
+        name, base = _related(key, lenses)
+        if base is None:
+            poses[name] = pose
+        else:
+            waiting[name] = base, pose
+    # a camera may be placed by one that is itself placed by another
+    for base in [base for base, _ in waiting.values() if base not in waiting]:
+        poses.setdefault(base, np.eye(4))
+    while ready := [name for name, (base, _) in waiting.items() if base in poses]:
+        for name in ready:
+            base, pose = waiting.pop(name)
+            poses.setdefault(name, pose @ poses[base])
+    cameras = []
+    for name, lens in lenses.items():
+        expect(lens, dict, file, f"cameras.{name}")
+        if name not in poses:
+            raise CaptureError(file, f"camera_poses.{name}", "missing: where does this camera stand?")
+        values = lens | {"R": poses[name][:3, :3].tolist(), "T": poses[name][:3, 3].tolist()}
+        cameras.append(_one_camera(name, values, lambda key, name=name: (file, f"cameras.{name}.{key}")))
+    return source.calibration(format, cameras)
+
+
+def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
+    """The camera that a key of `camera_poses` is of, and the one in whose axes it is, None for the world's."""
+    parts = key.split(RELATIVE)
+    for i in range(1, len(parts)):
+        name, base = RELATIVE.join(parts[:i]), RELATIVE.join(parts[i:])
+        if name in names and base in names:
+            return name, base
+    return key, None
+
+
 # TOML of Caliscope, Anipose and Pose2Sim: a table of each camera -------------------------------------------------------
 
 TOML_KEYS = {"matrix": "K", "rotation": "R", "translation": "T", "distortions": "dist", "size": "imgSize", "fisheye": "fisheye"}

@@ -1,0 +1,45 @@
+"""What a file is that no reader of calibrations knows, in words for an error."""
+
+import re
+from pathlib import Path
+
+from humangs_jax.data.capture_checks import few
+from humangs_jax.io.reading import open_file
+
+BINARIES = {
+    b"\x93NUMPY": "an array of NumPy, such as annots.npy of ZJU-MoCap",
+    b"PK\x03\x04": "an archive (.npz, .zip)",
+    b"\x89HDF": "an HDF5 file (.h5, .mat)",
+    b"MATLAB 5": "a file of MATLAB",
+    b"\x80": "a pickle",
+}
+"""How files begin that somebody may take for a calibration, and what they are."""
+HEAD = 4096
+"""Bytes that are looked at."""
+INTRINSICS = ("camera_matrix", "cameraMatrix", "CameraMatrix", "camera matrix", "Camera_Matrix", "intrinsic_matrix")
+"""Keys by which programs write the lens of one camera alone."""
+KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
+"""A key of JSON, YAML or TOML at the beginning of a line."""
+KEYS_SHOWN = 6
+"""In an error."""
+
+
+def binary_kind(file: Path) -> str | None:
+    """What a file is that holds no text, in words; None for text."""
+    with open_file(file) as opened:
+        head = opened.read(HEAD)
+    known = (kind for start, kind in BINARIES.items() if head.startswith(start))
+    return next(known, "a binary file" if b"\0" in head and not head.startswith((b"\xff\xfe", b"\xfe\xff")) else None)
+
+
+def described(text: str) -> str:
+    """What a text that is no calibration seems to be; nothing of an empty one."""
+    if not text.strip():
+        return ""
+    keys = KEY.findall(text.replace("{", "\n").replace(",", "\n"))
+    if "T_cn_cnm1" in keys or ("distortion_model" in keys and "intrinsics" in keys):
+        return "a camchain of Kalibr: write R and T of each camera into calibration.json, docs/cameras.md"
+    if any(key in INTRINSICS for key in keys):
+        return "the lens of one camera, without where it stands: K, R and T of each camera are needed"
+    names = list(dict.fromkeys(keys))
+    return f"it has the keys {few(names, KEYS_SHOWN)}" if names else f"a text that begins with {text.split()[0][:40]!r}"
