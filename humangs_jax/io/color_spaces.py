@@ -250,7 +250,17 @@ def read_profile(data: bytes) -> Profile:
     except (LookupError, struct.error, OverflowError, ValueError) as error:
         why = str(error) if isinstance(error, Refused) else "it is damaged"
         raise Refused(why) from error
-    return Profile(space, encoding)
+    return Profile(space, encoding._replace(curves=tuple(map(_within_white, encoding.curves))))
+
+
+def _within_white(curve: Curve) -> Curve:
+    """A curve of a file, whose formula may leave [0, 1], or numbers, between the levels that were looked at."""
+
+    def bounded(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+        with np.errstate(all="ignore"):
+            return np.clip(np.nan_to_num(curve(levels)), 0, 1)
+
+    return bounded
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:

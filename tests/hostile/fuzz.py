@@ -67,7 +67,7 @@ HEADERS = itertools.product((0, 9, 10, 70_000), (0, 12, 2**31), (1, 8, 16), rang
 CHUNKS = [(b"IHDR", struct.pack(">IIBBBBB", *header)) for header in itertools.islice(HEADERS, 0, None, 7)]
 CHUNKS += [
     (name, body)
-    for name in (b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND")
+    for name in (b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"cHRM", b"cICP", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND")
     for body in (b"", b"\0", bytes(40), b"x\0\0" + zlib.compress(bytes(99)))
 ]
 
