@@ -17,6 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.numerics import safe_normalize
@@ -189,6 +190,9 @@ CLEARLY, RATHER = 0.5, 0.8
 without."""
 FARTHEST = 1.0
 """Metres between a person's places in two frames that follow each other, where several views show where they are."""
+SHORTER, FAR = 0.3, 3.0
+"""Of the longest way: how much shorter the ways of people between two frames have to be than if two of them were exchanged; and
+from where on all ways count as equally long."""
 NEAR = 0.5
 """A share of a person's size in the photo: how far they go in the photo of one camera from one frame to the next."""
 RESIZED = 1.5
@@ -338,7 +342,8 @@ def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]
 def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None) -> list[list[Match | None]]:
     """The matches of frames that follow each other, so that the i-th of each is one person.
 
-    That is who is nearest in space to where the person was; of the rest, whoever is plainly nearest in the photo of one camera.
+    The ways of all together are the shortest, in space and, of those whom space does not tell, in the photos of one camera.
+    Where others are nearly as short, nobody is linked.
 
     Arguments: shown: the views of each frame; None: people are followed in space alone.
     Returns: for each frame a match for each person, None where the frame does not have the person. Whoever is linked to nobody
@@ -347,7 +352,9 @@ def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[See
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
         last = [max(g for g in range(f) if person[g] is not None) for person in people]
-        chosen = _near_in_space([_last_center(person) for person in people], matches)
+        centers = [_last_center(person) for person in people]
+        ways = np.asarray([[np.linalg.norm(match.center - center) for match in matches] for center in centers])
+        chosen = dict(_plainly_shortest(ways.reshape(len(people), len(matches)), FARTHEST))
         if shown is not None:
             free = [j for j in range(len(people)) if j not in chosen]
             left = [i for i in range(len(matches)) if i not in chosen.values()]
@@ -356,7 +363,7 @@ def in_order_of_time(frames: Sequence[list[Match]], shown: Sequence[Sequence[See
                 before = people[j][last[j]]
                 assert before is not None
                 costs[row, column] = _moved_in_photos(shown[last[j]], before, shown[f], matches[i])
-            chosen |= {free[row]: left[column] for row, column in _plainly_nearest(costs)}
+            chosen |= {free[row]: left[column] for row, column in _plainly_shortest(costs, NEAR)}
         for j, person in enumerate(people):
             person.append(matches[chosen[j]] if j in chosen else None)
         new = [match for i, match in enumerate(matches) if i not in chosen.values()]
@@ -370,29 +377,35 @@ def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
     return centers[-1] if centers else np.full(3, np.nan)
 
 
-def _near_in_space(last: Sequence[Float[np.ndarray, "3"]], matches: Sequence[Match]) -> dict[int, int]:
-    """For people who were at `last` the match that is nearest, the nearest pairs first."""
-    distances = [
-        (float(np.linalg.norm(match.center - center)), j, i) for j, center in enumerate(last) for i, match in enumerate(matches)
-    ]
-    chosen: dict[int, int] = {}
-    for _, j, i in sorted(each for each in distances if each[0] < FARTHEST):
-        if j not in chosen and i not in chosen.values():
-            chosen[j] = i
+def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
+    """People and their matches: those with the shortest ways of all together, where any others are plainly longer."""
+    ways = np.fmin(ways, FAR * longest)  # longer ones, and those that are not known, are all as unlikely
+    pairs = list(zip(*(each.tolist() for each in linear_sum_assignment(ways)), strict=True))
+    chosen = []
+    for j, i in pairs:
+        longer = [ways[j, k] + ways[m, i] - ways[j, i] - ways[m, k] for m, k in pairs if m != j]
+        # whoever has no match now, or is nobody's match, could have this one
+        longer += [ways[m, i] - ways[j, i] for m in range(len(ways)) if m not in {m for m, _ in pairs}]
+        longer += [ways[j, k] - ways[j, i] for k in range(ways.shape[1]) if k not in {k for _, k in pairs}]
+        if ways[j, i] < longest and min(longer, default=np.inf) >= SHORTER * longest:
+            chosen.append((j, i))
     return chosen
 
 
 def _moved_in_photos(before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match) -> float:
-    """How far one person would have gone in the photo of some camera, a share of the size; infinite if none shows both."""
-    moved = [float("inf")]
+    """How far one person would have gone in the photos of all cameras that show both, at the most, a share of the size.
+
+    Infinite if no camera does, or if the size in a photo changed too much.
+    """
+    moved = []
     for v, w in itertools.product(range(len(before)), range(len(now))):
         p, q = first.members[v], second.members[w]
         if p is None or q is None or not _stands_still(before[v], now[w]):
             continue
         (place, size), (other, other_size) = (_box(row) for row in (before[v].people[p], now[w].people[q]))
-        if max(size, other_size) <= RESIZED * min(size, other_size):
-            moved.append(float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9))
-    return min(moved)
+        resized = max(size, other_size) > RESIZED * min(size, other_size)
+        moved.append(float("inf") if resized else float(np.linalg.norm(other - place)) / max(size, other_size, 1e-9))
+    return max(moved, default=float("inf"))
 
 
 def _stands_still(before: Seen, now: Seen) -> bool:
@@ -409,16 +422,6 @@ def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
     seen = row[row[:, 2] >= SEEN, :2]
     seen = seen if len(seen) else row[:, :2]
     return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())
-
-
-def _plainly_nearest(costs: Float[np.ndarray, "n m"]) -> list[tuple[int, int]]:
-    """Pairs below `NEAR` that beat all others of their row and column by the factor `CLEARLY`."""
-    found = []
-    for row, column in np.argwhere(costs < NEAR).tolist():
-        others = np.r_[np.delete(costs[row], column), np.delete(costs[:, column], row)]
-        if costs[row, column] < CLEARLY * others.min(initial=np.inf):
-            found.append((row, column))
-    return found
 
 
 def match_colors(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:

@@ -387,6 +387,27 @@ def test_people_are_followed_over_time_by_where_they_are():
     assert later[0].center[0] == 0.2 and later[1] is None and later[2] is alone and later[3].center[0] == 5.0
 
 
+def places(*xs):
+    return [Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0])) for x in xs]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "linked"),
+    [
+        ((0.0,), (0.9,), [0]),
+        ((0.0, 0.8), (0.3, 1.1), [0, 1]),
+        ((0.0, 0.8), (1.1, 0.3), [1, 0]),
+        ((0.0, 1.0), (-1.4, -0.4), [None, None]),  # one walked to where the other was, whose way is too long
+        ((0.0, 0.4), (0.2, 9.0), [None, None]),  # who of them went away?
+        ((0.0,), (0.1, 0.2), [None]),
+    ],
+)
+def test_of_ways_that_are_as_short_none_is_taken(before, after, linked):
+    _, second = in_order_of_time([places(*before), places(*after)])
+    found = [None if match is None else after.index(match.center[0]) for match in second[: len(before)]]
+    assert found == linked
+
+
 SIDEWAYS = np.asarray([200.0, 0.0, 0.0])
 """Pixels, and no change of visibility."""
 
@@ -395,7 +416,7 @@ def test_whom_space_does_not_link_the_photo_of_one_camera_links():
     """One view of each moment: two people change their order in the list, and a third comes."""
     views, _ = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), 1)
     first, second = views[0].people
-    guest = first + SIDEWAYS
+    guest = first - SIDEWAYS
     shown = [[views[0]], [views[0]._replace(people=(second + 0.05 * SIDEWAYS, guest, first - 0.05 * SIDEWAYS))]]
     alone = lambda i: Match((i,), (False,), float("inf"), np.full(3, np.nan))
     matches = [[alone(0), alone(1)], [alone(0), alone(1), alone(2)]]
