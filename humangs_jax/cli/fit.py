@@ -243,6 +243,10 @@ class Fit:
         wrote(self.out, "body.npz, scan_fit.json and body_in_scan.ply")
 
 
+DEFAULT_SHEET = Path("check.png")
+"""What `humangs check` writes."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Check:
     """Draw the body over each photo, and name what looks wrong.
@@ -254,7 +258,7 @@ class Check:
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
-    out: Annotated[Path, Place((".png",))] = Path("check.png")
+    out: Annotated[Path, Place((".png",))] = DEFAULT_SHEET
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
@@ -262,6 +266,11 @@ class Check:
         require_file(sheet, (".png",))
         with stage("starting"):
             from humangs_jax.apps.check import check_capture
+            from humangs_jax.io.atomic import check_ours
+            from humangs_jax.io.images import is_own_output
+
+            unasked = [sheet, *([self.out] if self.out == DEFAULT_SHEET else [])]
+            check_ours(unasked, is_own_output, "choose another name by --out, or move it away")
             from humangs_jax.data.capture import load_capture
             from humangs_jax.detection.people import available
             from humangs_jax.fitting.files import UnknownViewError

@@ -114,3 +114,13 @@ def test_the_demo_replaces_an_earlier_one_and_nothing_else(tmp_path):
     assert (tmp_path / "avatar.npz").read_text() == "mine"
     (tmp_path / "report.json").write_text(json.dumps(dict.fromkeys(demo.REPORTED, 0)))
     demo._check_place(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "options"), [("check.png", []), ("check_fit.png", []), ("x_fit.png", ["--out", "x.png"])])
+def test_check_takes_no_name_that_nobody_asked_for_from_a_picture(name, options, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_png(name, GREY)
+    before = Path(name).read_bytes()
+    assert cli.execute(["check", str(DEMO), *options]) == cli.BAD_DATA
+    assert f"{name}: exists, and was not written by humangs: choose another name by --out" in capsys.readouterr().err
+    assert Path(name).read_bytes() == before
