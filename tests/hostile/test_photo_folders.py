@@ -19,7 +19,7 @@ from humangs_jax.apps import detect
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.keypoints.formats import read_people
-from humangs_jax.detection.people import detect_people
+from humangs_jax.detection.people import find_people
 from humangs_jax.io.images import read_grey, resized, to_uint8
 
 HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
@@ -197,7 +197,7 @@ def remembered():
     def find(networks, photo):
         key = (photo.shape, photo.tobytes())
         if key not in known:
-            known[key] = detect_people(networks, photo)
+            known[key] = find_people(networks, photo)
         return known[key]
 
     return find
@@ -205,7 +205,7 @@ def remembered():
 
 def run(kind, command, remembered, monkeypatch, capsys):
     """Exit code, lines of errors and of warnings."""
-    monkeypatch.setattr(detect, "detect_people", remembered)
+    monkeypatch.setattr(detect, "find_people", remembered)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     FOLDERS[kind][0](Path("photos"))
     code = cli.execute(command)

@@ -42,7 +42,7 @@ LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
 UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
 """Sets whose files may be of another one with as many points, and their points of the body."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif")
 
 
 def read_detections(path: Path) -> Detections:
