@@ -40,6 +40,7 @@ from humangs_jax.data.formats import CAMERAS, KEYPOINTS
 from humangs_jax.data.views import cropped, equal_exposure
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
+from humangs_jax.geometry import quaternion
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import image_size
 from humangs_jax.io.reading import read_json, reading, visible, write_json
@@ -331,7 +332,13 @@ def better_body(
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
-    """Between the cameras, seen from the person; a photo is none of its own neighbours."""
-    towards = np.asarray(capture.cameras.center) - np.asarray(capture.poses.translation)[np.asarray(capture.frames)]
+    """Between the cameras as the person sees them, in the axes of the pelvis: of somebody who turns before one camera, too. A
+    photo is none of its own neighbours.
+    """
+    frames = np.asarray(capture.frames)
+    pelvis = capture.poses.rotations[:, 0]
+    world_from_pelvis = np.asarray(quaternion.matrix_from_axis_angle(pelvis), np.float64)[frames]
+    towards = np.asarray(capture.cameras.center, np.float64) - np.asarray(capture.poses.translation, np.float64)[frames]
+    towards = np.einsum("vba,vb->va", world_from_pelvis, towards)
     towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
     return np.linalg.norm(towards[:, None] - towards, axis=-1) + 9 * np.eye(len(towards))

@@ -4,6 +4,8 @@ import dataclasses
 import shutil
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from changes import edit_json
@@ -17,16 +19,18 @@ from humangs_jax.apps.start import better_body, held_out_psnr, look, missing
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.video import write_video
 from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose
 from humangs_jax.body.resolution import decimate
 from humangs_jax.cli.start import Start
 from humangs_jax.data import capture as capture_module
-from humangs_jax.data.capture import load_capture
+from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import SeenPerson
 from humangs_jax.data.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import people as blazepose
 from humangs_jax.fitting import fit_capture
+from humangs_jax.geometry.camera import orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 from humangs_jax.network.presets import tiny
@@ -552,3 +556,22 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
         assert found is taken and estimate.psnr > 25
     few = toy.select([0, 1])
     assert better_body({}, tiny(), few, other, None) == (few, None)
+
+
+def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_nearest_other():
+    """Turning the person before one camera is going round the person with it, whichever frame a view shows."""
+    angles = np.radians([0.0, 90.0, 200.0, 215.0])
+    around = orbit(jnp.zeros(3), 3.0, jnp.asarray(-angles), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8)
+    before = orbit(jnp.zeros(3), 3.0, jnp.zeros(4), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8)
+    still, order = np.zeros((4, 1, 3), np.float32), np.asarray([2, 0, 3, 1])
+    turning = still.copy()
+    turning[order, 0, 1] = angles
+    poses = lambda rotations: jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.zeros((4, 3)))
+    K, matrices = before.K, before.cam_from_world
+    capture = capture_from_arrays(np.ones((4, 8, 8, 3)), K, matrices, np.zeros((1, 55, 3)), np.zeros((1, 3)))
+    of = lambda cameras, rotations: start._distances(
+        dataclasses.replace(capture, cameras=cameras, poses=poses(rotations), frames=order.astype(np.int32))
+    )
+    found = of(before, turning)
+    np.testing.assert_allclose(found, of(around, still), atol=1e-5)
+    assert set(np.argwhere(found == found.min())[0].tolist()) == {2, 3}
