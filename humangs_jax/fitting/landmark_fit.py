@@ -348,7 +348,7 @@ def smooth_motion(
     def costs(state):
         """(m,) of the keypoints of each frame."""
         landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(state)
-        errors = lambda each, points: half_squares(keypoint_residuals(model, each, points, ROBUST_SCALES[-1]))
+        errors = lambda each, points: half_squares(keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1]))
         return jax.vmap(errors)(seen, landmarks)
 
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
