@@ -208,6 +208,7 @@ def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calib
         up="+y",
         stations=None if found.moments == 1 else 1,
         upright=True,
+        estimated=True,
     )
 
 

@@ -177,15 +177,15 @@ class Fit:
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
             from humangs_jax.fitting.files import check_place, write_fitted
-            from humangs_jax.fitting.refine import refine_capture, usual_config
+            from humangs_jax.fitting.refine import cameras_are_unseen, refine_capture, usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
-        fixed, bare = self.refinement.fixed_cameras, self.scan.bare
-        config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
+        fixed, bare = self.refinement.fixed_cameras or cameras_are_unseen(start), self.scan.bare
+        config = usual_config(record is not None, fixed_cameras=fixed, bare=bare, calibrated=start.calibrated)
         with stage("refining cameras and body"):
             refinement = refine_capture(start, keypoints=keypoints, config=config)
         tell(refinement.report)

@@ -11,20 +11,15 @@ from humangs_jax.cli.captures import keypoints_of, tell_found
 from humangs_jax.cli.options import ITERATIONS_ALONE, UsageError, first_refinement, off, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
-from humangs_jax.data.formats import CAMERAS, KEYPOINTS
+from humangs_jax.data.formats import CAMERAS, KEYPOINTS, START_MARK
 
 if TYPE_CHECKING:
     from humangs_jax.apps.start import HeldOut, Material
     from humangs_jax.data.calibration.importing import ImportReport
     from humangs_jax.data.capture import Capture
 
-MARK = "start.json"
+MARK = START_MARK
 """In a capture folder that `humangs start` imported: a later run may replace it until it has a body, and go on from there."""
-
-
-def _without_head(limits: dict[str, Any] | None) -> dict[str, Any] | None:
-    """For cameras from the person: centimetres that they are off blur a face, and steps on the head would fit the blur."""
-    return None if limits is None else limits | {"head_steps": 0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +124,7 @@ class Start:
 
                 capture = load_capture(self.out, fit_masks=self.fit_masks)
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
-            estimated = isinstance(mark, dict) and mark.get("calibrated") is False
-            self._finish(capture, None, _without_head(limits) if estimated else limits)
+            self._finish(capture, None, limits)
             return
         if self.overwrite:
             tell_deleted(self.out)
@@ -170,7 +164,7 @@ class Start:
                 masks=material.masks,
                 own_masks=own_masks,
                 reduce=not (material.keypoints or material.masks or material.alpha),
-                also=self._mark(calibrated=False),
+                also=self._mark(),
             )
         tell("\n".join(found.lines))
         tell_found(found.people, found.person)
@@ -178,7 +172,7 @@ class Start:
             warn(warning)
         wrote(self.out / SHEET_FILE, "who was found in the photos")
         material = self._with_found(material, own_masks)
-        self._finish(*self._fit(material, found.one_moment), _without_head(limits))
+        self._finish(*self._fit(material), limits)
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
         with stage("finding the person"):
@@ -250,7 +244,7 @@ class Start:
             warn(f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}")
         return report
 
-    def _fit(self, material: "Material", one_moment: bool | None = None) -> "tuple[Capture, HeldOut | None]":
+    def _fit(self, material: "Material") -> "tuple[Capture, HeldOut | None]":
         with stage("fitting the body"):
             from humangs_jax.apps.detect import MASKS
             from humangs_jax.apps.start import better_body
@@ -258,7 +252,7 @@ class Start:
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
-            from humangs_jax.fitting.refine import refine_capture, usual_config
+            from humangs_jax.fitting.refine import cameras_are_unseen, refine_capture, usual_config
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -267,7 +261,7 @@ class Start:
             photos = load_photos(self.out, fit_masks=self.fit_masks and material.masks != self.out / MASKS)
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
             keypoints = keypoints_of(photos, material.keypoints, None if found_here else self.person)
-            fitted = fit_photos(photos, keypoints, load_body(), fixed_cameras=one_moment is not None)
+            fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):
             report = fitted.report
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
@@ -275,12 +269,13 @@ class Start:
         capture, estimate = fitted.capture, None
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
-                fixed, calibrated = not (fitted.camera_errors or one_moment), one_moment is None
+                # calibrated ones move where the keypoints have shown that they are off
+                fixed = not fitted.camera_errors if capture.calibrated else cameras_are_unseen(capture)
                 loose, tight = (
                     refine_capture(
                         capture,
                         keypoints=fitted.record.keypoints,
-                        config=usual_config(fitted=True, fixed_cameras=fixed, tight=tight, calibrated=calibrated),
+                        config=usual_config(fitted=True, fixed_cameras=fixed, tight=tight, calibrated=capture.calibrated),
                     )
                     for tight in (False, True)
                 )

@@ -81,6 +81,8 @@ class Capture:
     displacement: Float[np.ndarray, "n 3"] | None = None
     """Metres by which the vertices of the shaped body move in the T-pose, as another tool registered them (SMPL+D); joints stay.
     It belongs to `betas`: who changes those leaves it out. None: `reconstruct` finds one by the masks."""
+    calibrated: bool = True
+    """False: the cameras were found from the person, and are centimetres off."""
 
     __repr__ = short_repr
 
@@ -139,6 +141,7 @@ def capture_from_arrays(
     body: BodyModel | None = None,
     body_file: str | Path = DEFAULT_BODY,
     displacement: Any | None = None,
+    calibrated: bool = True,
     source: str = "arrays",
 ) -> Capture:
     """A checked capture from arrays.
@@ -159,6 +162,7 @@ def capture_from_arrays(
         body: the model. None: that of `body_file`.
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
+        calibrated: False for cameras that were found from the person: refinement moves them further.
         source: what errors call the arrays.
 
     Returns:
@@ -198,7 +202,7 @@ def capture_from_arrays(
         if fit_masks:
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
-    photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
+    photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names, calibrated)
     return _assemble(photos, body, body_file, *parameters)
 
 
@@ -373,7 +377,7 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
         views.append(view)
     background = "photo" if capture.masks is None else "white"
     write_npz(folder / "body.npz", capture_parameters(target, capture), compressed=False)
-    write_description(folder, views, background)
+    write_description(folder, views, background, capture.calibrated)
 
 
 def capture_parameters(folder: Path, capture: Capture) -> dict[str, np.ndarray]:

@@ -12,6 +12,9 @@ from typing import Any, Literal, TypeVar
 from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 from humangs_jax.io.reading import visible
 
+START_MARK = "start.json"
+"""What `humangs start` leaves in a capture folder that it made."""
+
 # Cameras and keypoints --------------------------------------------------------------------------------------------------
 # The module of a row has two functions; where several recognize a file, the first reads it, those of its suffix before others.
 # Suffixes are for files that are neither JSON nor text.

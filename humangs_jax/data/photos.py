@@ -27,10 +27,11 @@ from humangs_jax.data.capture_checks import (
     members,
     numbers,
 )
+from humangs_jax.data.formats import START_MARK
 from humangs_jax.data.masks import clean_rims, masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, orientation, read_grey, read_image
-from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown, write_json
+from humangs_jax.io.reading import FileError, check_limit, inside, read_json, reading, shown, write_json
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +40,7 @@ VERSION = 1
 DEMO_CAPTURE = "demo_capture"
 """Name of the capture of a synthetic person that comes with the package."""
 TOP_KEYS = {"format", "version", "body", "background", "views"}
+OPTIONAL_TOP_KEYS = {"calibrated"}
 VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
 OFF_CENTER = 0.05
@@ -62,6 +64,8 @@ class Photos:
     """The frame that each view shows."""
     names: tuple[str, ...]
     """One per view."""
+    calibrated: bool = True
+    """False: the cameras were found from the person."""
 
     @property
     def frame_count(self) -> int:
@@ -96,7 +100,9 @@ def read_description(file: Path) -> dict[str, Any]:
     for key, wanted in (("format", FORMAT), ("version", VERSION)):
         if (found := expect(description, dict, file, "").get(key)) != wanted:
             raise CaptureError(file, key, f"expected {wanted!r}, got {shown(found)}")
-    check_keys(description, TOP_KEYS, TOP_KEYS - {"background"}, file)
+    check_keys(description, TOP_KEYS | OPTIONAL_TOP_KEYS, TOP_KEYS - {"background"}, file)
+    if not isinstance(description.get("calibrated", True), bool):
+        raise CaptureError(file, "calibrated", f"expected true or false, got {shown(description['calibrated'])}")
     body, views = members(description, file, body=str, views=list)
     if Path(body).suffix != ".npz":  # fits write it: it must not be a photo
         raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
@@ -118,10 +124,30 @@ def check_inside(file: Path, field: str, name: str, photo: bool = False) -> None
         inside(file.parent, name, photo)
 
 
-def write_description(folder: Path, views: Sequence[dict[str, Any]], background: Background = "photo") -> None:
+def write_description(
+    folder: Path, views: Sequence[dict[str, Any]], background: Background = "photo", calibrated: bool = True
+) -> None:
     """Write capture.json of views with the keys of the format; the body is in body.npz."""
-    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
-    write_json(folder / "capture.json", description)
+    description: dict[str, Any] = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background}
+    if not calibrated:
+        description["calibrated"] = False
+    write_json(folder / "capture.json", description | {"views": views})
+
+
+def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
+    """Whether the cameras of a capture are of a calibration, which is what is supposed where nothing else is said.
+
+    Before captures said so themselves, `humangs start` left it in a file beside them.
+    """
+    if "calibrated" in description:
+        return description["calibrated"]
+    mark = folder / START_MARK
+    if not mark.is_file():
+        return True
+    with contextlib.suppress(FileError):
+        found = read_json(mark)
+        return not (isinstance(found, dict) and found.get("calibrated") is False)
+    return True
 
 
 def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = "") -> None:
@@ -199,7 +225,7 @@ def read_photos(
     _check_orientations(folder, views, K, width, height, warns=chosen is None)
     cameras = [checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]") for i in range(len(views))]
     names = names_from_paths([view["image"] for view in views])
-    return Photos(images, masks, stack_cameras(cameras), frames, names)
+    return Photos(images, masks, stack_cameras(cameras), frames, names, is_calibrated(folder, description))
 
 
 def _check_orientations(

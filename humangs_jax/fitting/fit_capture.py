@@ -257,7 +257,7 @@ def fit_photos(
     """Find shape and poses of the person in photos, and turn cameras back that the keypoints show to be turned.
 
     Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes from, see `Capture`.
-    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are.
+    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are, as do those that were found from the person.
     Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or the body's root is not its
     first joint.
     """
@@ -265,6 +265,7 @@ def fit_photos(
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos")
     if body.parents.index(-1) != 0:
         raise ValueError(f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}")
+    fixed_cameras = fixed_cameras or not photos.calibrated  # found from such keypoints, which tell nothing new about them
     errors = () if fixed_cameras else tuple(e for e in find_camera_errors(photos, keypoints) if not e.late)
     photos = mended(photos, errors) if errors else photos
     kind = keypoints.set

@@ -122,6 +122,11 @@ def usual_config(
     return dataclasses.replace(config, std=std)
 
 
+def cameras_are_unseen(capture: Capture) -> bool:
+    """Whether nothing tells how cameras should move: they were found from the person, and each photo shows a pose of its own."""
+    return not capture.calibrated and capture.frame_count >= capture.view_count
+
+
 # The state of a capture ----------------------------------------------------------------------------------------------
 
 

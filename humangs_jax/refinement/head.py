@@ -62,9 +62,11 @@ class Crops(NamedTuple):
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Whether photos are large enough for steps on the head."""
+    """Whether photos are large enough for steps on the head, and cameras exact enough: those that were found from the person are
+    centimetres off. That blurs a face, and the steps would fit the blur.
+    """
     longest = max(capture.images.shape[1:3])
-    return min(longest, config.image_size or longest) >= LEAST_SIDE
+    return capture.calibrated and min(longest, config.image_size or longest) >= LEAST_SIDE
 
 
 def sharpened(avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock) -> Avatar:

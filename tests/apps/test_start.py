@@ -22,15 +22,18 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.resolution import decimate
 from humangs_jax.cli.start import Start
-from humangs_jax.data import capture as capture_module
-from humangs_jax.data.capture import capture_from_arrays, load_capture
+from humangs_jax.data.calibration.importing import import_calibration
+from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import SeenPerson
 from humangs_jax.data.keypoints.keypoints import COCO_17, MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import people as blazepose
 from humangs_jax.fitting import fit_capture
-from humangs_jax.geometry.camera import orbit
+from humangs_jax.fitting.person_cameras import PersonCameras
+from humangs_jax.fitting.person_moments import PersonViews
+from humangs_jax.fitting.refine import usual_config
+from humangs_jax.geometry.camera import Camera, orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
 from humangs_jax.io.reading import write_json
 from humangs_jax.network.presets import tiny
@@ -150,7 +153,7 @@ def detected(mine, monkeypatch):
         bystander = Found(person, mask[:60, :20], (0, 0), 2e5)  # larger, but nobody's masks or keypoints are there
         shown.append(PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5))))
 
-    def stop(self, material, one_moment=None):
+    def stop(self, material):
         told.append(material)
         raise ValueError("the fit")
 
@@ -295,28 +298,35 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     np.testing.assert_allclose(apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2)
 
 
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_steps_on_the_head_are_for_calibrated_cameras(calibrated, mine, detected, monkeypatch):
-    """Those from the person are centimetres off, in the first run and in one that goes on from its body."""
-    asked = []
-    monkeypatch.setattr(Start, "_fit", lambda self, material, one_moment=None: (None, None))
-    monkeypatch.setattr(Start, "_finish", lambda self, capture, estimate, limits: asked.append(limits))
-    found = photos_alone.PhotosImported((), (), detect.found_in_capture("me"), 1, True)
+def test_cameras_from_the_person_are_no_calibrated_ones_in_the_capture(tmp_path):
+    points = np.full((1, 2, 2), 4.0)
+    seen = PersonViews(points, np.ones((1, 2)), np.ones((1, 2, 3)), ("nose", "neck"), ((8, 8),), np.asarray([8.0]), ("a.png",))
+    cam_from_world = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]]
+    camera = Camera.from_opencv([[8, 0, 4], [0, 8, 4], [0, 0, 1]], cam_from_world, 8, 8)
+    found = PersonCameras((0,), (camera,), np.ones((1, 2, 3)), np.zeros(1, bool), 1, np.zeros(1), ())
+    (tmp_path / "photos").mkdir()
+    write_png(tmp_path / "photos" / "a.png", np.ones((8, 8, 3)))
+    import_calibration(photos_alone._calibration(seen, found, tmp_path / "photos"), tmp_path / "photos", tmp_path / "me")
+    assert not load_photos(tmp_path / "me").calibrated
 
-    def imported(_, out, *, also, **options):
-        out.mkdir()
-        for name, content in also.items():
-            write_json(out / name, content)
-        return found
 
-    monkeypatch.setattr(photos_alone, "import_photos", imported)
-    if not calibrated:
-        without(mine, *TOOLS)
-    assert cli.execute(["start", str(mine), "--out", "me"]) == 0
-    monkeypatch.setattr(Start, "_resumes", lambda self: True)
-    monkeypatch.setattr(capture_module, "load_capture", lambda path, fit_masks: None)
-    assert cli.execute(["start", str(mine), "--out", "me"]) == 0
-    assert ["head_steps" in limits for limits in asked] == [not calibrated] * 2
+def test_refinement_takes_cameras_for_calibrated_if_the_capture_says_so(tmp_path, monkeypatch):
+    """A capture with a pose for each photo tells nothing about its cameras: they stay."""
+    configs = []
+
+    def refine_capture(capture, *, keypoints, config):
+        configs.append(config)
+        raise ValueError("far enough")
+
+    monkeypatch.setattr("humangs_jax.fitting.refine.refine_capture", refine_capture)
+    demo = load_capture("demo_capture")
+    alone = dataclasses.replace(demo.select([0]), frames=np.zeros(1, np.int32))
+    for capture, calibrated in ((demo, True), (demo, False), (alone, True), (alone, False)):
+        save_capture(tmp_path / "me", dataclasses.replace(capture, calibrated=calibrated), overwrite=True)
+        assert cli.execute(["fit", str(tmp_path / "me"), "--refine", "--overwrite"]) != 0
+    starts = [usual_config(False, calibrated=calibrated) for calibrated in (True, False)] * 2
+    assert [config.keypoints_worse for config in configs] == [config.keypoints_worse for config in starts]
+    assert [config.fixed_cameras for config in configs] == [False, False, False, True]
 
 
 def test_large_photos_are_reduced_upright_and_small_ones_stay(tmp_path, monkeypatch):
@@ -385,7 +395,7 @@ def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
     without(mine, "cameras")
     first = Start(mine, Path("me"), height=1.7)
     Path("me").mkdir()
-    for name, content in {"capture.json": {}, "fit.json": {}, **first._mark(calibrated=False)}.items():
+    for name, content in {"capture.json": {}, "fit.json": {}, **first._mark()}.items():
         write_json(Path("me") / name, content)
     Path("me/body.npz").touch()
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.8"]) == cli.BAD_USAGE

@@ -14,6 +14,7 @@ from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_cap
 from humangs_jax.data.photos import check_photos, load_photos, names_from_paths
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
+from humangs_jax.io.reading import read_json, write_json
 
 HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
 HALF_LEVEL = 0.5 / 255 + 1e-6
@@ -434,3 +435,29 @@ def test_a_failed_write_leaves_what_was_there(folder, monkeypatch):
         save_capture(folder, capture_from_arrays(**arrays(1)), overwrite=True)
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
     assert [p.name for p in folder.parent.iterdir()] == ["me"]
+
+
+def test_whether_cameras_are_calibrated_is_written_and_read(tmp_path):
+    capture = load_capture("demo_capture").resized(32)
+    assert capture.calibrated
+    estimated = dataclasses.replace(capture.select([1, 2]), calibrated=False)
+    save_capture(tmp_path / "me", estimated)
+    found = load_capture(tmp_path / "me")
+    assert not found.calibrated and not load_photos(tmp_path / "me").calibrated and not found.select([0]).calibrated
+    save_capture(tmp_path / "again", found.resized(16))
+    assert not load_capture(tmp_path / "again").calibrated
+    save_capture(tmp_path / "other", capture)
+    assert "calibrated" not in read_json(tmp_path / "other" / "capture.json")
+    edit_json(tmp_path / "me" / "capture.json", lambda description: description.update(calibrated="no"))
+    with pytest.raises(CaptureError, match=r"capture\.json: calibrated: expected true or false, got 'no'"):
+        load_capture(tmp_path / "me")
+
+
+MARKS = ({"calibrated": False}, False), ({"calibrated": True}, True), ({}, True), ([], True)
+
+
+@pytest.mark.parametrize(("mark", "calibrated"), MARKS)
+def test_of_an_older_capture_the_run_that_made_it_tells_whether_cameras_are_calibrated(mark, calibrated, tmp_path):
+    save_capture(tmp_path / "me", load_capture("demo_capture", views=[0]).resized(32))
+    write_json(tmp_path / "me" / "start.json", mark)
+    assert load_capture(tmp_path / "me").calibrated == calibrated

@@ -14,7 +14,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
-from humangs_jax.fitting import person_bundle
+from humangs_jax.fitting import fit_capture, person_bundle
 from humangs_jax.fitting.camera_errors import find_camera_errors, mended
 from humangs_jax.fitting.fit_capture import examine, fit_photos
 from humangs_jax.fitting.person_cameras import cameras_from_person, scaled_to_height
@@ -352,3 +352,26 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
     masks = np.zeros(truth.images.shape[:3], np.float32)
     said = lambda capture, known: str(check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known))
     assert "--fixed-cameras" not in said(wrong, keypoints) + said(truth, None)
+
+
+def test_cameras_that_were_found_from_the_person_are_not_turned_back_by_the_same_keypoints(monkeypatch):
+    truth, keypoints = person(1, 1, 4)
+    wrong = turned(truth, [2], (1.0, 0.0, 0.5))
+    looked_for, fitted = [], []
+
+    def fit_landmarks(model, observations, smoothness):
+        fitted.append(observations.cam_from_world)
+        raise ValueError("far enough")
+
+    def find(photos, keypoints):
+        looked_for.append(photos.calibrated)
+        return find_camera_errors(photos, keypoints)
+
+    monkeypatch.setattr(fit_capture, "fit_landmarks", fit_landmarks)
+    monkeypatch.setattr(fit_capture, "find_camera_errors", find)
+    for calibrated in (True, False):
+        photos = Photos(wrong.images, None, wrong.cameras, wrong.frames, wrong.names, calibrated)
+        with pytest.raises(ValueError, match="far enough"):
+            fit_photos(photos, keypoints, truth.body)
+    assert looked_for == [True]
+    np.testing.assert_array_equal(fitted[1][0], wrong.cameras.cam_from_world)

@@ -10,6 +10,7 @@ from refinement_cases import HEIGHT
 from humangs_jax.avatar.animate import with_low_pass_of
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture
 from humangs_jax.refinement import head as heads
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import HEAD, RefineConfig
@@ -112,3 +113,9 @@ def test_colors_count_in_the_mask_and_excess_alpha_costs_more(four):
     change = 0.1 * (photo.mask == 0), 0.1 * (photo.mask > 0.5)
     grown, shrunk = loss(photo.image, photo.mask + change[0]), loss(photo.image, photo.mask - change[1])
     assert grown / change[0].mean() > 5 * shrunk / change[1].mean()
+
+
+def test_cameras_from_the_person_blur_a_face_and_get_no_steps_on_the_head():
+    capture = load_capture("demo_capture").resized(heads.LEAST_SIDE)
+    assert shows_heads(capture, ALONE)
+    assert not shows_heads(dataclasses.replace(capture, calibrated=False), ALONE)

@@ -87,6 +87,7 @@ class Calibration:
     observations: None where the format has none. convention: what the matrices in the file mean, of `CONVENTIONS`.
     stations: how many cameras took the images, where the format says; None: one for each of `cameras`. mask_key: where the file
     names masks, None if it does not. upright: whether cameras are of photos that obey their EXIF orientation; else sizes tell.
+    estimated: whether the cameras were found from the person.
     """
 
     format: str
@@ -100,6 +101,7 @@ class Calibration:
     stations: int | None = None
     mask_key: str | None = None
     upright: bool = False
+    estimated: bool = False
     unit: float | None = None
     """Metres in the unit of the format, None where it may be any."""
 

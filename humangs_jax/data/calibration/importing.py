@@ -318,7 +318,7 @@ def _write(
             cut += [photo.image.name] if at_rim else []
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
-    write_description(folder, views)
+    write_description(folder, views, calibrated=not calibration.estimated)
     return cut
 
 
