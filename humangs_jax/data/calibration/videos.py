@@ -233,7 +233,7 @@ def _expression(numbers: Sequence[int]) -> str:
     ]
     if len(terms) > MOST_RUNS:
         count = f"{len(numbers):,} frames to be paired by time with those of other rates"
-        raise Refused(f"{count}: expected fewer (--every, --max-frames)")
+        raise Refused(f"{count}: expected a larger step, or fewer frames")
     return "+".join(terms)
 
 
