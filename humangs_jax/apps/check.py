@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from humangs_jax.apps.crops import around_person
 from humangs_jax.apps.quick_check import faults
 from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.joints import FINGERS
@@ -119,9 +120,10 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
     """
     right = keypoints is not None and not find_camera_errors(capture, keypoints)
     found = faults(capture)
+    whole, vertices = capture, _posed_frames(capture)
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
-    vertices, tints = _posed_frames(capture), side_tints(capture.body)
+    shown, tints = _shown(whole, capture, vertices), side_tints(capture.body)
     moves, worn = capture.displacement, None
     if capture.masks is not None:
         moves = displacement(capture.body, capture, always=False) if moves is None else moves
@@ -138,14 +140,24 @@ def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None
             iou, outside = _agreement(np.asarray(drawn.covered), capture.masks[i] > MASK_THRESHOLD)
             if warning is None and outside > MOST_OUTSIDE:
                 warning = WIDER.format(outside, *(FIXED if right else FREE))
-        overlays.append(overlay(capture.images[i], drawn))
+        if shown is not capture:
+            drawn = _body_image(vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i])
+        overlays.append(overlay(shown.images[i], drawn))
         if displaced is not None:
-            moved = _body_image(displaced[int(capture.frames[i])], body.faces, moved_tints, capture.cameras[i])
+            moved = _body_image(displaced[int(capture.frames[i])], body.faces, moved_tints, shown.cameras[i])
             overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
         views.append(ViewCheck(name, iou, outside, inside, warning))
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     farthest = 0.0 if moves is None else float(np.linalg.norm(moves[: len(capture.body.template)], axis=1).max())
     return CheckReport(tuple(views), found.whole, farthest, capture.displacement is not None, worn is not None)
+
+
+def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
+    """What a sheet shows of a capture: its photos cut to the person, or `small`, all of them, where that is nearly the same."""
+    close, _ = around_person(whole, vertices)
+    if close is whole:
+        return small
+    return close.resized(LONGEST_SIDE) if max(close.images.shape[1:3]) > LONGEST_SIDE else close
 
 
 def draw_body(
@@ -230,7 +242,10 @@ def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, 
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
-    drawn = [_with_keypoints(_overlay(capture, view), capture, keypoints, examination, view) for view in chosen]
+    compared = [examination.compared[view] for view in range(count)]
+    marks = [keypoints.points[view][compared[view]] for view in range(count)]
+    close, corners = around_person(capture, _posed_frames(capture), marks)
+    drawn = [_with_keypoints(_overlay(close, view), close, corners[view], keypoints, examination, view) for view in chosen]
     contact_sheet(np.stack(drawn), out, labels=[_fit_label(examination, view) for view in chosen])
 
 
@@ -241,15 +256,21 @@ def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
 
 
 def _with_keypoints(
-    image: Float[np.ndarray, "h w 3"], capture: Capture, keypoints: Keypoints, examination: Examination, view: int
+    image: Float[np.ndarray, "h w 3"],
+    capture: Capture,
+    corner: Int[np.ndarray, "2"],
+    keypoints: Keypoints,
+    examination: Examination,
+    view: int,
 ) -> Float[np.ndarray, "h w 3"]:
+    """The image of a view with its keypoints. corner: of the photo of `capture` in the one that keypoints are of, pixels."""
     from PIL import Image, ImageDraw
 
     height, width = image.shape[:2]
     canvas = Image.fromarray(to_uint8(image)).resize((FINE * width, FINE * height), Image.Resampling.BILINEAR)
     pen = ImageDraw.Draw(canvas)
     scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
-    within = lambda points: np.clip(points * scale, -FINE * width, 2 * FINE * width)
+    within = lambda points: np.clip((points - corner) * scale, -FINE * width, 2 * FINE * width)
     discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
     shown = np.flatnonzero(examination.compared[view])
     radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
