@@ -57,7 +57,7 @@ def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
     sizes = {(camera.width, camera.height): name for name, camera in cameras.items()}
     if len(sizes) > 1:
         shown = ", ".join(f"{name} has {width} x {height}" for (width, height), name in sorted(sizes.items())[:2])
-        raise ValueError(f"{path}: images of several sizes, {shown}: expected one size, or --width and --height")
+        raise ValueError(f"{path}: images of several sizes, {shown}: expected one size, or a width and a height")
     return stack_cameras(list(cameras.values()))
 
 
