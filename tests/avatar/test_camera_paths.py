@@ -83,7 +83,7 @@ def test_the_world_of_a_file_is_turned_so_that_its_up_is_ours(tmp_path):
 
 def test_images_of_several_sizes_are_refused_unless_a_size_is_given(tmp_path):
     file = write_transforms(tmp_path / "transforms.json", around([0.0, 1.0]), sizes=[(40, 32), (32, 40)])
-    with pytest.raises(ValueError, match=r"several sizes, 0001 has 32 x 40, 0000 has 40 x 32: expected one size, or --width"):
+    with pytest.raises(ValueError, match=r"several sizes, 0001 has 32 x 40, 0000 has 40 x 32: expected one size, or a width"):
         one_size(file, file_cameras(file, Shot(), upright=True))
     assert one_size(file, file_cameras(file, Shot(width=20, height=16), upright=True)).width == 20
 
