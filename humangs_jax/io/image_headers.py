@@ -1,16 +1,29 @@
-"""What the bytes of a photo say before it is decoded: the scans of a JPEG, the size of a WebP, the kind of an ISO file.
+"""What a photo says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's kind, a PNG's chunks, EXIF's frame.
 
 Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its segments (thumbnails, EXIF, C2PA). Only the
 marks of the picture itself count.
 """
 
 import re
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
 
 from humangs_jax.io.reading import Refused
 
 HEIC_BRANDS = frozenset((b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"))
 """Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
 AVIF_BRANDS = frozenset((b"avif", b"avis"))
+PALETTE = 3
+"""PNG's color type of pixels that are numbers of a palette."""
+FRAME_TAGS = (0xA002, 0xA003)
+"""EXIF's width and height of the photo as it was taken."""
+SAME_SHAPE = 0.01
+"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel, by rounding."""
+LARGEST_SIDE = 1 << 24
+"""Pixels; sensors have less."""
 MARKED_BRANDS = 16
 """Brands of a box `ftyp` that are looked at; files have up to ten."""
 
@@ -91,3 +104,38 @@ def nclx_colors(data: bytes) -> tuple[int, int] | None:
     if at < 0 or len(numbers) < 4:
         return None
     return int.from_bytes(numbers[:2], "big"), int.from_bytes(numbers[2:], "big")
+
+
+def check_png_chunks(data: bytes) -> None:
+    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
+    at, names = 8, set()
+    while at < len(data) and b"IEND" not in names:
+        length, name = struct.unpack(">I4s", data[at : at + 8])
+        body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+        if len(check) < 4 or zlib.crc32(name + body) != int.from_bytes(check, "big"):
+            raise ValueError(f"chunk {name!r} is damaged or cut off")
+        names.add(name)
+        at += 12 + length
+    if missing := {b"IDAT", b"IEND"} - names:
+        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
+    if data[25] == PALETTE and b"PLTE" not in names:
+        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
+
+
+def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
+    """Width and height in EXIF's tags if a photo of this size was cut out of such a frame, else None."""
+    width, height = (tags.get(tag) for tag in FRAME_TAGS)
+    if not isinstance(width, int) or not isinstance(height, int):
+        return None
+    frame, turned = (width, height), (height, width)
+    if not 0 < min(frame) <= max(frame) < LARGEST_SIDE or _same_shape(size, frame):
+        return None
+    # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
+    cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
+    return None if _same_shape(size, turned) and not cut_upright else frame
+
+
+def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
+    scale = np.hypot(*size) / np.hypot(*frame)
+    off = np.abs(scale * np.asarray(frame) - size)
+    return bool((off <= 1 + SAME_SHAPE * np.asarray(size)).all())

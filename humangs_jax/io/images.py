@@ -14,7 +14,6 @@ import io
 import logging
 import struct
 import warnings
-import zlib
 from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,17 @@ import numpy as np
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.color_spaces import Encoding, by_tables, is_srgb, of_code_points, of_gamma, pixels_in_srgb, read_profile
-from humangs_jax.io.image_headers import JPEG_START, is_webp, iso_kind, jpeg_scans, nclx_colors, png_chunks, webp_size
+from humangs_jax.io.image_headers import (
+    JPEG_START,
+    check_png_chunks,
+    is_webp,
+    iso_kind,
+    jpeg_scans,
+    nclx_colors,
+    other_frame,
+    png_chunks,
+    webp_size,
+)
 from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
 
 logger = logging.getLogger(__name__)
@@ -39,10 +48,6 @@ GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
 ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
-FRAME_TAGS = (0xA002, 0xA003)
-"""EXIF's width and height of the photo as it was taken."""
-SAME_SHAPE = 0.01
-"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel, by rounding."""
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
 EXIF_MARKS = (b"Exif", b"eXIf", b"EXIF", b"ftypavi", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
@@ -55,8 +60,8 @@ DRAWN, MASK = "humangs_jax", "humangs_jax mask"
 """Values of the text `Software` in PNG files: of pictures that show results, which are never photos, and of masks."""
 MARK_HEAD = 1024
 """Bytes of a PNG file in which the text stands: it is written before the pixels."""
-PALETTE, GREY_AND_ALPHA = 3, 4
-"""Color types: of pixels that are numbers of a palette, and of two channels."""
+GREY_AND_ALPHA = 4
+"""The color type of two channels."""
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
@@ -88,7 +93,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """
     with open_image(path) as (image, data):
         if image.format == "PNG":
-            _check_chunks(data)
+            check_png_chunks(data)
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
             colors = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
             return _mask_of_labels(np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0))))
@@ -154,7 +159,7 @@ def focal_length(path: str | Path) -> float | None:
     with open_image(path) as (image, data):
         tags = _exif(image, data, EXIF_TAGS)
         equivalent = tags.get(FOCAL_LENGTH_35MM_TAG)
-        if not isinstance(equivalent, int) or equivalent <= 0 or _other_frame(tags, image.size) is not None:
+        if not isinstance(equivalent, int) or equivalent <= 0 or other_frame(tags, image.size) is not None:
             return None
         return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
 
@@ -165,29 +170,7 @@ def cropped_from(path: str | Path) -> tuple[int, int] | None:
     Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
-        return _other_frame(_exif(image, data, EXIF_TAGS), image.size)
-
-
-def _other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
-    width, height = (tags.get(tag) for tag in FRAME_TAGS)
-    if not isinstance(width, int) or not isinstance(height, int):
-        return None
-    frame, turned = (width, height), (height, width)
-    if not 0 < min(frame) <= max(frame) < LARGEST_SIDE or _same_shape(size, frame):
-        return None
-    # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
-    cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
-    return None if _same_shape(size, turned) and not cut_upright else frame
-
-
-LARGEST_SIDE = 1 << 24
-"""Pixels; sensors have less."""
-
-
-def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
-    scale = np.hypot(*size) / np.hypot(*frame)
-    off = np.abs(scale * np.asarray(frame) - size)
-    return bool((off <= 1 + SAME_SHAPE * np.asarray(size)).all())
+        return other_frame(_exif(image, data, EXIF_TAGS), image.size)
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
@@ -397,7 +380,7 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """
     with open_image(path) as (image, data):
         found = image.size, "A" in image.getbands() or "transparency" in image.info
-        _check_chunks(data) if image.format == "PNG" else image.load()
+        check_png_chunks(data) if image.format == "PNG" else image.load()
     return found
 
 
@@ -422,13 +405,31 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
 def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
     """Whole levels as stored, and the largest that there may be."""
     if data[:8] == PNG_SIGNATURE:
-        _check_chunks(data)
+        check_png_chunks(data)
         if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
             return _deep_pixels(data), 65535
     if image.mode.startswith("I"):  # 16-bit grey
         return np.asarray(image).astype(np.uint16)[..., None], 65535
     has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB")), 255
+
+
+def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
+    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes the lower ones, too."""
+    if data[26:28] != b"\0\0" or data[28] > 1:
+        raise Refused("not a readable image: a PNG header with unknown methods")
+    if data[25] == GREY_AND_ALPHA:
+        both = _decoded(data, "RGBA")  # the four bytes of a pixel
+        return both[..., 0::2] << 8 | both[..., 1::2]
+    mode = PNG_COLOR_TYPES[data[25]]
+    return _decoded(data, f"{mode};16B") << 8 | _decoded(data, f"{mode};16L")
+
+
+def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
+    """Bytes of the pixels of a PNG file, chosen by the name that Pillow has for their layout."""
+    with image_in(data) as image:
+        image.tile = [(*tile[:3], raw) for tile in image.tile]
+        return np.asarray(image).astype(np.uint16)
 
 
 # Colors -----------------------------------------------------------------------------------------------------------------
@@ -496,40 +497,3 @@ def _by_tables(image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], mo
 def _tell(line: str) -> None:
     """Warn once: photos are read several times."""
     logger.warning("%s", line)
-
-
-# PNG --------------------------------------------------------------------------------------------------------------------
-
-
-def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
-    """The pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it decodes the lower ones, too."""
-    if data[26:28] != b"\0\0" or data[28] > 1:
-        raise Refused("not a readable image: a PNG header with unknown methods")
-    if data[25] == GREY_AND_ALPHA:
-        both = _decoded(data, "RGBA")  # the four bytes of a pixel
-        return both[..., 0::2] << 8 | both[..., 1::2]
-    mode = PNG_COLOR_TYPES[data[25]]
-    return _decoded(data, f"{mode};16B") << 8 | _decoded(data, f"{mode};16L")
-
-
-def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
-    """Bytes of the pixels of a PNG file, chosen by the name that Pillow has for their layout."""
-    with image_in(data) as image:
-        image.tile = [(*tile[:3], raw) for tile in image.tile]
-        return np.asarray(image).astype(np.uint16)
-
-
-def _check_chunks(data: bytes) -> None:
-    """Whether a PNG file is whole: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
-    at, names = 8, set()
-    while at < len(data) and b"IEND" not in names:
-        length, name = struct.unpack(">I4s", data[at : at + 8])
-        body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-        if len(check) < 4 or zlib.crc32(name + body) != int.from_bytes(check, "big"):
-            raise ValueError(f"chunk {name!r} is damaged or cut off")
-        names.add(name)
-        at += 12 + length
-    if missing := {b"IDAT", b"IEND"} - names:
-        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
-    if data[25] == PALETTE and b"PLTE" not in names:
-        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
